@@ -1,0 +1,238 @@
+"""Batched MuJoCo: one `mjData` a robot, stepped by threads that never hold the interpreter lock.
+
+The loop over robots is compiled (numba) and calls the MuJoCo library directly, so the Python work of a step is a few
+calls a thread, whatever the number of robots. Results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.errors import MissingExtraError
+
+try:
+    import llvmlite.binding
+    import mujoco
+    import numba
+    from numba import types
+except ImportError as error:  # pragma: no cover - exercised in an environment without the extra
+    raise MissingExtraError(error.name or "mujoco", "mujoco") from error
+
+Array = NDArray[Any]
+
+_CHUNK = 4  # robots a thread claims at a time: small enough to balance falls and contacts, large enough to be cheap
+
+
+def _load_library() -> None:
+    """Make the symbols of the MuJoCo library that the Python package already loaded visible to compiled code."""
+    folder = Path(mujoco.__file__).parent
+    found = [p for p in folder.iterdir() if p.name.startswith(("libmujoco", "mujoco.dll")) and p.is_file()]
+    if not found:
+        raise MissingExtraError("the MuJoCo shared library", "mujoco")
+    llvmlite.binding.load_library_permanently(str(found[0]))
+
+
+_load_library()
+_P = types.intp
+_mj_step = types.ExternalFunction("mj_step", types.void(_P, _P))
+_mj_forward = types.ExternalFunction("mj_forward", types.void(_P, _P))
+_mj_reset = types.ExternalFunction("mj_resetData", types.void(_P, _P))
+_mj_contact_forces = types.ExternalFunction("mj_rnePostConstraint", types.void(_P, _P))
+_memmove = types.ExternalFunction("memmove", _P(_P, _P, types.uintp))
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-untyped-def]
+    """Copy robot i's fields, one behind the other, into row i of the frame (float64)."""
+    destination = frame_address + i * frame_width * 8
+    for k in range(sizes.shape[0]):
+        _memmove(destination, sources[i, k], sizes[k] * 8)
+        destination += sizes[k] * 8
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _advance(  # type: ignore[no-untyped-def]
+    robots, models, datas, substeps, forces,
+    ctrl_at, ctrl_address, ctrl_width, push_at, push_address, sources, sizes, frame_address, frame_width,
+):  # fmt: skip
+    for i in robots:
+        _memmove(ctrl_at[i], ctrl_address + i * ctrl_width * 8, ctrl_width * 8)
+        _memmove(push_at[i], push_address + i * 48, 48)
+        for _ in range(substeps):
+            _mj_step(models[i], datas[i])
+        if forces:
+            _mj_contact_forces(models[i], datas[i])
+        _gather(i, sources, sizes, frame_address, frame_width)
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _restart(  # type: ignore[no-untyped-def]
+    robots, models, datas, qpos_at, qpos_address, nq, qvel_at, qvel_address, nv, sources, sizes, frame_address, frame_width
+):  # fmt: skip
+    for i in robots:
+        _mj_reset(models[i], datas[i])
+        _memmove(qpos_at[i], qpos_address + i * nq * 8, nq * 8)
+        _memmove(qvel_at[i], qvel_address + i * nv * 8, nv * 8)
+        _mj_forward(models[i], datas[i])
+        _gather(i, sources, sizes, frame_address, frame_width)
+
+
+def _address(array: Array) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+class Physics:
+    """N independent MuJoCo simulations of one model, advanced together.
+
+    Args:
+        xml: path of the MJCF file.
+        num_robots: N.
+        fields: names of float64 `mjData` arrays to bring back after each step, such as ("qpos", "qvel", "cfrc_ext").
+        push_body: name or index of the body on which `advance(push=...)` acts.
+        contact_forces: also compute `cfrc_ext` after each step (`mj_rnePostConstraint`).
+        threads: worker threads; default: one per core this process may use.
+
+    `frame[name]` is the field of all robots, shape (N, *field shape), a view that the next step overwrites.
+    """
+
+    def __init__(
+        self,
+        xml: str | Path,
+        num_robots: int,
+        fields: Sequence[str],
+        *,
+        push_body: str | int = 1,
+        contact_forces: bool = False,
+        threads: int | None = None,
+    ) -> None:
+        self.model = mujoco.MjModel.from_xml_path(str(xml))
+        self.num_robots = num_robots
+        self.threads = max(1, min(threads or available_cores(), num_robots))
+        self.models = [self.model] * num_robots
+        self.datas = [mujoco.MjData(self.model) for _ in range(num_robots)]
+        self.qpos0, self.qvel0 = self.datas[0].qpos.copy(), self.datas[0].qvel.copy()
+        self._forces = contact_forces
+        self._push_body = self.model.body(push_body).id
+        self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
+
+        shapes = {name: getattr(self.datas[0], name).shape for name in fields}
+        self._sizes = np.array([int(np.prod(s)) for s in shapes.values()], dtype=np.intp)
+        self._width = int(self._sizes.sum())
+        self._frame = np.zeros((num_robots, self._width))
+        offsets = np.cumsum([0, *self._sizes])
+        self.frame: dict[str, Array] = {
+            name: self._frame[:, offsets[k] : offsets[k + 1]].reshape(num_robots, *shape)
+            for k, (name, shape) in enumerate(shapes.items())
+        }
+        self._fields = tuple(fields)
+        self._ctrl = np.zeros((num_robots, self.model.nu))
+        self._push = np.zeros((num_robots, 6))
+        self._qpos = np.zeros((num_robots, self.model.nq))
+        self._qvel = np.zeros((num_robots, self.model.nv))
+        self._point()
+
+    def _point(self) -> None:
+        """Note where each robot's arrays live, once: MuJoCo never moves them."""
+        at = lambda name: np.array([_address(getattr(d, name)) for d in self.datas], dtype=np.intp)  # noqa: E731
+        self._models_at = np.array([m._address for m in self.models], dtype=np.intp)
+        self._datas_at = np.array([d._address for d in self.datas], dtype=np.intp)
+        self._ctrl_at, self._qpos_at, self._qvel_at = at("ctrl"), at("qpos"), at("qvel")
+        self._push_at = at("xfrc_applied") + self._push_body * 48
+        self._sources = np.ascontiguousarray(np.stack([at(name) for name in self._fields], axis=1))
+
+    def vary(self, mass: Array, friction: Array) -> None:
+        """Give each robot its own model: masses and inertias scaled by `mass` (N,), sliding friction by `friction` (N,)."""
+        scratch = mujoco.MjData(self.model)
+        self.models = []
+        for scale_mass, scale_friction in zip(mass, friction, strict=True):
+            model = copy.copy(self.model)
+            model.body_mass[:] *= scale_mass
+            model.body_inertia[:] *= scale_mass
+            model.geom_friction[:, 0] *= scale_friction
+            # Constants that the compiler derived from the masses: without this, centres of mass (and with them Humanoid's
+            # observations) are wrong by scale_mass times the distance from the origin.
+            mujoco.mj_setConst(model, scratch)
+            self.models.append(model)
+        self._point()
+
+    def advance_async(self, robots: Array, ctrl: Array, push: Array | None, substeps: int) -> list[Future[None]]:
+        """Start `substeps` physics steps of the given robots (indices) in the background; `wait` for the result.
+
+        ctrl: (N, nu) actuator commands; push: (N, 6) force (N) and torque (N m) on the push body, or None.
+        """
+        self._ctrl[:] = ctrl
+        self._push[:] = 0.0 if push is None else push
+        return self._spread(
+            _advance, robots,
+            self._models_at, self._datas_at, substeps, self._forces,
+            self._ctrl_at, _address(self._ctrl), self.model.nu, self._push_at, _address(self._push),
+            self._sources, self._sizes, _address(self._frame), self._width,
+        )  # fmt: skip
+
+    def restart(self, robots: Array, qpos: Array, qvel: Array) -> None:
+        """Put the given robots (indices, n of them) at qpos (n, nq) and qvel (n, nv), everything else at its initial value."""
+        self._qpos[robots], self._qvel[robots] = qpos, qvel
+        wait(
+            self._spread(
+                _restart, robots,
+                self._models_at, self._datas_at,
+                self._qpos_at, _address(self._qpos), self.model.nq, self._qvel_at, _address(self._qvel), self.model.nv,
+                self._sources, self._sizes, _address(self._frame), self._width,
+            )  # fmt: skip
+        )
+
+    def _spread(self, kernel: Any, robots: Array, *arguments: Any) -> list[Future[None]]:
+        robots = np.ascontiguousarray(robots, dtype=np.intp)
+        counter = itertools.count(0, _CHUNK)
+
+        def work(counter: Iterator[int]) -> None:
+            while (start := next(counter)) < len(robots):
+                kernel(robots[start : start + _CHUNK], *arguments)
+
+        workers = min(self.threads, -(-len(robots) // _CHUNK))
+        return [self._pool.submit(work, counter) for _ in range(workers)]
+
+    def get_state(self) -> Array:
+        """Full integration state of every robot, (N, S) float64: what is needed to continue bit for bit."""
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.zeros((self.num_robots, mujoco.mj_stateSize(self.model, spec)))
+        for model, data, row in zip(self.models, self.datas, state, strict=True):
+            mujoco.mj_getState(model, data, row, spec)
+        return state
+
+    def set_state(self, state: Array) -> None:
+        """Restore what `get_state` returned. `frame` is not refreshed: restore it too (see `MujocoFleet.load_state_dict`)."""
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        for model, data, row in zip(self.models, self.datas, state, strict=True):
+            mujoco.mj_setState(model, data, row, spec)
+            mujoco.mj_forward(model, data)
+            mujoco.mj_setState(model, data, row, spec)
+
+    @property
+    def raw_frame(self) -> Array:
+        """All fields of all robots, (N, width) float64, in one array."""
+        return self._frame
+
+    def close(self) -> None:
+        """Stop the worker threads."""
+        self._pool.shutdown()
+
+
+def wait(futures: list[Future[None]]) -> None:
+    """Wait for background work and raise what it raised."""
+    for future in futures:
+        future.result()
+
+
+def available_cores() -> int:
+    """How many cores this process may use (respects affinity masks)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)

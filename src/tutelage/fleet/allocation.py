@@ -1,0 +1,98 @@
+"""Which human helps which robot: the allocation policy omega of Fleet-DAgger (algorithm 4, eq. 5.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.errors import ConfigError, ContractError
+from tutelage.fleet.modes import Mode
+
+Array = NDArray[Any]
+NOBODY = -1
+
+
+class FleetDAgger:
+    """Algorithm 4: keep interventions until their minimum time, then give free humans to the highest priorities.
+
+    Args:
+        t_teleop: t_T, minimum timesteps of a teleoperation.
+        t_reset: t_R, timesteps of a hard reset.
+    """
+
+    def __init__(self, t_teleop: int = 5, t_reset: int = 5) -> None:
+        for name, value in (("t_teleop (t_T)", t_teleop), ("t_reset (t_R)", t_reset)):
+            if value < 1:
+                raise ConfigError(f"{name} must be at least 1 timestep, got {value}")
+        self.t_teleop, self.t_reset = t_teleop, t_reset
+
+    def __call__(self, ranks: Array, previous: Array, mode: Array, age: Array, rng: np.random.Generator) -> Array:
+        """The robot of each human during the coming step, (M,) int, or `NOBODY`: a one-to-one partial matching.
+
+        A human whose minimum time is over competes for the best robots like a free one, but stays with the present
+        robot if that is among them.
+
+        Args:
+            ranks: (N, K) priorities, compared lexicographically; a robot whose K numbers are all <= 0 needs nobody.
+            previous: (M,) the robot of each human during the last step, or `NOBODY`.
+            mode: (N,) the mode of each robot.
+            age: (N,) timesteps that each robot has been in its mode.
+            rng: breaks ties between equal priorities.
+
+        Raises:
+            ContractError: a priority is NaN.
+        """
+        robots = np.where(self.locked(previous, mode, age), previous, NOBODY)
+        (free,) = np.nonzero(robots == NOBODY)
+        wanted = highest(ranks, len(free), exclude=robots[robots != NOBODY], rng=rng)
+
+        stays = free[np.isin(previous[free], wanted)]  # lines 7-10 fell through, yet the robot is still among the best
+        robots[stays] = previous[stays]
+        others = wanted[~np.isin(wanted, robots[stays])]
+        movers = free[~np.isin(free, stays)][: len(others)]  # lines 15-17
+        robots[movers] = others
+        return robots
+
+    def locked(self, previous: Array, mode: Array, age: Array) -> Array:
+        """Which humans must stay where they are, (M,) bool (lines 4-10)."""
+        robot = np.maximum(previous, 0)
+        kind, time = mode[robot], age[robot]
+        busy = (
+            (kind == Mode.SWITCHING)
+            | ((kind == Mode.RESETTING) & (time < self.t_reset))
+            | ((kind == Mode.TELEOPERATED) & (time < self.t_teleop))
+        )
+        return np.asarray((previous != NOBODY) & busy)
+
+
+def highest(ranks: Array, k: int, exclude: Array, rng: np.random.Generator) -> Array:
+    """The at most k robots of highest positive priority that are not in `exclude`, from highest to lowest (line 13).
+
+    Column by column: a partial sort finds the k-th largest value; robots above it are in, robots equal to it are decided
+    by the next column, and at last by a random number, so no robot is preferred for its index. O(N), not O(N log N).
+    """
+    if np.isnan(ranks).any():
+        raise ContractError(f"the priority of robot {int(np.argmax(np.isnan(ranks).any(axis=1)))} is NaN")
+    columns = [ranks[:, c] for c in range(ranks.shape[1])]
+    eligible = columns[0] > 0
+    for column in columns[1:]:
+        eligible |= column > 0
+    eligible[exclude] = False
+    (tied,) = np.nonzero(eligible)
+    chosen: list[Array] = []
+    for column in columns:
+        if len(tied) <= k or k == 0:
+            break
+        values = column[tied]
+        cut = np.partition(values, len(values) - k)[len(values) - k]
+        above = tied[values > cut]
+        chosen.append(above)
+        k -= len(above)
+        tied = tied[values == cut]
+    if len(tied) > k:
+        tied = rng.choice(tied, k, replace=False)
+    best = np.concatenate([*chosen, tied])
+    order = np.lexsort([rng.random(len(best)), *(column[best] for column in reversed(columns))])
+    return np.asarray(best[order[::-1]])

@@ -1,0 +1,239 @@
+"""The loop. Every algorithm of the dissertation is this loop with four choices: policy, priority, supervisors, learner.
+
+    observe -> score -> allocate -> act -> step -> reset and re-observe -> record -> learn
+
+A single robot with one human is a fleet with N = M = 1. Everything else (recording, progress, checkpoints, plots, the
+console) subscribes to the loop's steps; the loop does not know it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.errors import ConfigError, ContractError
+from tutelage.fleet.allocation import NOBODY, FleetDAgger
+from tutelage.fleet.events import Journal
+from tutelage.fleet.fleet import Fleet
+from tutelage.fleet.modes import HELPED, MOVING, Event, Mode, transition
+from tutelage.fleet.policy import Learner, Policy
+from tutelage.fleet.priority import Priority
+from tutelage.fleet.step import Step, Subscriber
+from tutelage.fleet.supervisor import Team
+from tutelage.fleet.view import FleetView, Signal
+from tutelage.seeding import derive, rng_state, set_rng_state, stream
+
+Array = NDArray[Any]
+
+
+class Loop:
+    """N robots, M humans, one policy.
+
+    Args:
+        fleet: the robots.
+        policy: pi_theta, shared by all robots.
+        priority: p-hat.
+        team: the M humans.
+        allocator: omega, with t_T and t_R.
+        learner: the update function f of eq. 5.3; None: the policy stays as it is.
+        signals: how to compute what the priority looks at, by name; `uncertainty` is the policy's own by default.
+        subscribers: listeners.
+        overlap: learn while physics runs. The update at step t then sees the data up to t - 1; it still changes the
+            policy from t + 1 on.
+        seed: root seed.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        policy: Policy,
+        priority: Priority,
+        team: Team,
+        allocator: FleetDAgger | None = None,
+        learner: Learner | None = None,
+        signals: Mapping[str, Signal] | None = None,
+        subscribers: Sequence[Subscriber] = (),
+        overlap: bool = False,
+        seed: int = 0,
+    ) -> None:
+        if len(team) > fleet.num_envs:
+            raise ConfigError(f"{len(team)} humans for {fleet.num_envs} robots: use at most one human a robot (M <= N)")
+        if team.latency.any() and not fleet.can_pause:
+            raise ConfigError("switching latency needs a fleet that can pause robots, and this one cannot")
+        self.fleet, self.policy, self.priority, self.team = fleet, policy, priority, team
+        self.allocator = allocator or FleetDAgger()
+        self.learner, self.overlap, self.subscribers = learner, overlap, list(subscribers)
+        self.signals: dict[str, Signal] = {"uncertainty": lambda view: policy.uncertainty(view.obs)}  # type: ignore[attr-defined]
+        if not hasattr(policy, "uncertainty"):
+            del self.signals["uncertainty"]
+        self.signals |= signals or {}
+
+        n = fleet.num_envs
+        self.t = 0
+        self.rng = stream(seed, "loop/ties")
+        self.mode = np.full(n, Mode.AUTONOMOUS, dtype=np.int8)
+        self.age = np.zeros(n, dtype=np.int64)
+        self.robot_of = np.full(len(team), NOBODY)
+        self.human_action = np.full((n, len(fleet.action_low)), np.nan, dtype=np.float32)
+        self.journal = Journal()
+        self.obs, info = fleet.reset(seed=derive(seed, "fleet") % 2**32)
+        self.violation = info["violation"]
+
+    def run(self, steps: int) -> None:
+        """Run until timestep `steps`, telling the subscribers; an exception reaches them as the end of the run."""
+        for subscriber in self.subscribers:
+            subscriber.on_start(self)
+        try:
+            while self.t < steps:
+                step = self.step()
+                for subscriber in self.subscribers:
+                    subscriber.on_step(self, step)
+        finally:
+            for subscriber in self.subscribers:
+                subscriber.on_end(self)
+
+    def step(self) -> Step:
+        """One timestep of all robots."""
+        self.journal.t = self.t
+        view = self._observe()
+        self._allocate(self.priority(view))
+        actions, mode, human = self._act(view), self.mode.copy(), self.human_of
+        losses: dict[str, float] = {}
+
+        self.fleet.step_async(actions, active=MOVING[mode])
+        if self.learner and self.overlap:
+            losses = self.learner.update(self.t)
+        next_obs, reward, _, truncated, info = self.fleet.step_wait()
+
+        success = info["success"] & ~info["violation"]  # a robot that fell has not completed anything
+        self._finish(next_obs, info["violation"], success, truncated)
+        step = Step(
+            self.t, view.obs, view.actions, actions, mode, human, reward, next_obs,
+            info["violation"], success, truncated, self.journal.take(), view.computed, losses,
+        )  # fmt: skip
+        if self.learner:
+            self.learner.record(step)
+            if not self.overlap:
+                losses.update(self.learner.update(self.t))
+        self.t += 1
+        return step
+
+    @property
+    def human_of(self) -> Array:
+        """The human who is with each robot, (N,), or -1."""
+        human = np.full(self.fleet.num_envs, NOBODY)
+        (busy,) = np.nonzero(self.robot_of != NOBODY)
+        human[self.robot_of[busy]] = busy
+        return human
+
+    # -- the phases of a step, in their order -------------------------------------------------------------------
+
+    def _observe(self) -> FleetView:
+        self._check(self.obs, "the observation")
+        actions = np.asarray(self.policy.act(self.obs))
+        expected = (self.fleet.num_envs, len(self.fleet.action_low))
+        if actions.shape != expected:
+            raise ContractError(f"{type(self.policy).__name__}.act must return {expected}, got {actions.shape}")
+        self._check(actions, f"the action of {type(self.policy).__name__}")
+        return FleetView(
+            self.t, self.obs, actions, self.violation, HELPED[self.mode], self.age, self.human_action, self.rng, self.signals
+        )
+
+    def _allocate(self, ranks: Array) -> None:
+        if ranks.ndim != 2 or len(ranks) != self.fleet.num_envs or not ranks.shape[1]:
+            raise ContractError(f"a priority must return ({self.fleet.num_envs}, K), got {ranks.shape}")
+        before = self.robot_of
+        # A reset that is over, or a fall while teleoperated, ended the intervention: its human is free again.
+        ended = ~HELPED[self.mode[np.maximum(before, 0)]]
+        self.robot_of = self.allocator(ranks, before, self.mode, self.age, self.rng)
+        changed = self.robot_of != before
+
+        (left,) = np.nonzero((before != NOBODY) & changed & ~ended)
+        self._happen(Event.RELEASE, before[left], left)
+        (came,) = np.nonzero((self.robot_of != NOBODY) & (changed | ended))
+        self._happen(Event.ASSIGN, self.robot_of[came], came)
+
+        (busy,) = np.nonzero(self.robot_of != NOBODY)
+        robots = self.robot_of[busy]
+        ready = (self.mode[robots] == Mode.SWITCHING) & (self.age[robots] >= self.team.latency[busy])
+        broken = self.violation[robots]
+        self._happen(Event.START_RESET, robots[ready & broken], busy[ready & broken])
+        self._happen(Event.TAKE_OVER, robots[ready & ~broken], busy[ready & ~broken])
+
+    def _act(self, view: FleetView) -> Array:
+        actions = view.actions.astype(np.float32, copy=True)
+        (robots,) = np.nonzero(self.mode == Mode.TELEOPERATED)
+        if robots.size:
+            low, high = self.fleet.action_low, self.fleet.action_high
+            commanded = self.team.act(view.obs[robots], robots, self.human_of[robots], actions.shape[1])
+            actions[robots] = self.human_action[robots] = np.clip(commanded, low, high)
+        return actions
+
+    def _finish(self, obs: Array, violation: Array, success: Array, truncated: Array) -> None:
+        """End of the step: note what happened, reset whom it is due, and look again."""
+        self.age += 1
+        human = self.human_of
+        moving = MOVING[self.mode]
+        (fallen,) = np.nonzero(moving & violation)
+        self._happen(Event.VIOLATE, fallen, human[fallen])
+        for event, mask in ((Event.SUCCESS, success), (Event.TIMEOUT, truncated & ~success & ~violation)):
+            (robots,) = np.nonzero(moving & mask)
+            self._happen(event, robots, human[robots])
+        (righted,) = np.nonzero((self.mode == Mode.RESETTING) & (self.age >= self.allocator.t_reset))
+        self._happen(Event.HARD_RESET, righted, human[righted])
+
+        again = moving & (success | truncated) & ~violation
+        again[righted] = True
+        self.obs, self.violation = obs, violation
+        if again.any():
+            self._check(obs, "the last observation")  # the loop goes on from another one, but critics learn from it
+            self.obs, info = self.fleet.reset(options={"reset_mask": again})
+            self.violation = info["violation"]
+
+    def _check(self, values: Array, what: str) -> None:
+        if len(values) != self.fleet.num_envs:
+            raise ContractError(f"{what} is there for {len(values)} robots, and the fleet has {self.fleet.num_envs}")
+        if not np.isfinite(values).all():
+            bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+            raise ContractError(f"{what} is not finite for robot {int(np.argmax(bad))} at timestep {self.t}")
+
+    def _happen(self, event: Event, robots: Array, humans: Array) -> None:
+        if len(robots):
+            after = transition(self.mode, robots, event)
+            self.age[robots] = np.where(after == self.mode[robots], self.age[robots], 0)
+            self.mode[robots] = after
+            self.journal.add(event, robots, humans, after)
+
+    # -- resume -------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue bit for bit, as nested dictionaries of arrays and JSON values."""
+        return {
+            "t": self.t,
+            "rng": rng_state(self.rng),
+            "mode": self.mode.copy(),
+            "age": self.age.copy(),
+            "robot_of": self.robot_of.copy(),
+            "human_action": self.human_action.copy(),
+            "obs": np.array(self.obs),
+            "violation": np.array(self.violation),
+            "fleet": self.fleet.state_dict(),
+            "team": self.team.state_dict(),
+            "priority": self.priority.state_dict(),
+            **({"learner": self.learner.state_dict()} if self.learner else {}),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.t = state["t"]
+        set_rng_state(self.rng, state["rng"])
+        for name in ("mode", "age", "robot_of", "human_action", "obs", "violation"):
+            setattr(self, name, state[name].copy())
+        self.fleet.load_state_dict(state["fleet"])
+        self.team.load_state_dict(state["team"])
+        self.priority.load_state_dict(state["priority"])
+        if self.learner:
+            self.learner.load_state_dict(state["learner"])

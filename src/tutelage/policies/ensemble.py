@@ -1,0 +1,93 @@
+"""The robot policy of chapter 5: a bootstrapped ensemble whose spread is its uncertainty."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from tutelage.policies.mlp import BatchedMLP
+
+Array = NDArray[Any]
+
+
+class EnsemblePolicy(nn.Module):
+    """The mean of K networks acts; the variance between them is the uncertainty.
+
+    Args:
+        obs_width: D.
+        action_low, action_high: (A,) bounds.
+        members: K.
+        hidden: widths of the hidden layers.
+        seed: of the initial weights.
+    """
+
+    def __init__(
+        self,
+        obs_width: int,
+        action_low: Array,
+        action_high: Array,
+        *,
+        members: int = 5,
+        hidden: tuple[int, ...] = (256, 256),
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.action_middle: Tensor
+        self.action_half: Tensor
+        self.obs_mean: Tensor
+        self.obs_std: Tensor
+        self.members = members
+        self.net = BatchedMLP(
+            members, obs_width, len(action_low), hidden, torch.Generator().manual_seed(seed), last=torch.tanh
+        )
+        low, high = torch.as_tensor(action_low).float(), torch.as_tensor(action_high).float()
+        self.register_buffer("action_middle", (high + low) / 2)
+        self.register_buffer("action_half", (high - low) / 2)
+        self.register_buffer("obs_mean", torch.zeros(obs_width))
+        self.register_buffer("obs_std", torch.ones(obs_width))
+        self._seen: Array | None = None
+        self._said = torch.empty(0)
+
+    def set_normalisation(self, obs: Array) -> None:
+        """Z-score inputs with the mean and standard deviation of obs (n, D), from now on."""
+        self.obs_mean.copy_(torch.from_numpy(obs.mean(axis=0)))
+        self.obs_std.copy_(torch.from_numpy(obs.std(axis=0).clip(1e-2)))
+        self.forget()
+
+    def normalise(self, obs: Tensor) -> Tensor:
+        """(..., D) float32 -> z-scores, clipped to 10 standard deviations."""
+        return ((obs - self.obs_mean) / self.obs_std).clamp_(-10, 10)
+
+    def loss(self, obs: Tensor, actions: Tensor) -> Tensor:
+        """Mean squared error of each member on its own batch, summed over members, in units of half the action range.
+
+        obs: (K, B, D), actions: (K, B, A).
+        """
+        target = (actions - self.action_middle) / self.action_half
+        error: Tensor = (self.net(self.normalise(obs)) - target).square().mean(dim=(1, 2)).sum()
+        return error
+
+    def forget(self) -> None:
+        """Drop the memory of the last observations: call after the weights changed."""
+        self._seen = None
+
+    @torch.no_grad()
+    def _ask(self, obs: Array) -> Tensor:
+        """What each member would do, (K, N, A) in units of half the range; one pass for `act` and `uncertainty`."""
+        if self._seen is not obs:
+            self._said = self.net(self.normalise(torch.from_numpy(np.asarray(obs, dtype=np.float32))))
+            self._seen = obs
+        return self._said
+
+    def act(self, obs: Array) -> Array:
+        """The mean of the members: (N, D) -> (N, A) float32."""
+        return (self.action_middle + self.action_half * self._ask(obs).mean(dim=0)).numpy()
+
+    def uncertainty(self, obs: Array) -> Array:
+        """Ensemble variance, mean over actions, in units of the variance of the pair {low, high}: (N,), 0 to 1."""
+        # Members speak in units of half the range, whose pair {-1, 1} has variance 1: no further division.
+        return self._ask(obs).var(dim=0, correction=0).mean(dim=-1).numpy()

@@ -1,0 +1,52 @@
+"""K multilayer perceptrons trained side by side as batched matrix products."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+
+class BatchedMLP(nn.Module):
+    """K independent ReLU networks of one shape: (K, B, inputs) -> (K, B, outputs), one `baddbmm` a layer.
+
+    Args:
+        members: K.
+        inputs, outputs: widths.
+        hidden: widths of the hidden layers.
+        generator: draws the initial weights (uniform, He et al. as in torch.nn.Linear).
+        last: applied to the outputs, such as torch.tanh.
+    """
+
+    def __init__(
+        self,
+        members: int,
+        inputs: int,
+        outputs: int,
+        hidden: tuple[int, ...],
+        generator: torch.Generator,
+        last: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        self.last = last
+        widths = [inputs, *hidden, outputs]
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for a, b in pairwise(widths):
+            bound = 1 / math.sqrt(a)
+            draw = lambda *shape, bound=bound: (torch.rand(shape, generator=generator) * 2 - 1) * bound  # noqa: E731
+            self.weights.append(nn.Parameter(draw(members, a, b)))
+            self.biases.append(nn.Parameter(draw(members, 1, b)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(K, B, inputs), or (B, inputs) for the same inputs to all members -> (K, B, outputs)."""
+        if x.dim() == 2:
+            x = x.expand(len(self.weights[0]), *x.shape)
+        depth = len(self.weights)
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
+            if k < depth - 1:
+                x = x.relu()
+        return self.last(x) if self.last else x
