@@ -126,7 +126,7 @@ class FakePolicy:
 
     def uncertainty(self, obs: Any) -> Any:
         self.log.append("policy.uncertainty")
-        return np.broadcast_to(self.spread(obs) if callable(self.spread) else self.spread, len(obs))
+        return self.spread(obs) if callable(self.spread) else np.full(len(obs), self.spread)
 
 
 class FakeSupervisor:

@@ -53,7 +53,7 @@ def allocate(ranks, previous, mode, age, rng: Generator | None = None):
 
 @given(situations())
 def test_it_is_algorithm_4_up_to_ties(situation) -> None:
-    ranks, previous, mode, _ = situation
+    ranks, previous, _, _ = situation
     locked, candidates = algorithm_4(*situation)
     robots = allocate(*situation)
 

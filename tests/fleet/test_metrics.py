@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from fakes import PointFleet, make_loop
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -16,13 +16,10 @@ from tutelage.errors import ContractError
 from tutelage.fleet import metrics
 from tutelage.fleet.allocation import FleetDAgger
 from tutelage.fleet.events import Events
-from tutelage.fleet.fleet import Fleet
-from tutelage.fleet.loop import Loop
 from tutelage.fleet.metrics import EventLog, Tally
 from tutelage.fleet.modes import END_OF_STEP, HELPED, INVALID, TABLE, Event, Mode
 from tutelage.fleet.priority import parse
 from tutelage.fleet.step import Step
-from tutelage.fleet.supervisor import PolicySupervisor, Team
 
 Array = NDArray[Any]
 Row = tuple[int, int, int, Event, Mode]
@@ -289,54 +286,13 @@ def test_the_tally_of_any_walk_through_the_modes_is_the_summary_of_its_log(log: 
 # -- against the loop -------------------------------------------------------------------------------------------------------
 
 
-class Clumsy(Fleet):
-    """Robots that fall, succeed and run out of time at random."""
-
-    def __init__(self, n: int, seed: int) -> None:
-        self.num_envs, self.horizon = n, 6
-        self.single_action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-        self.rng = np.random.default_rng(seed)
-        self.clock, self.violation = np.zeros(n, int), np.zeros(n, bool)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
-        self.clock[mask], self.violation[mask] = 0, False
-        return self.obs, {"violation": self.violation.copy(), "success": np.zeros(self.num_envs, bool)}
-
-    @property
-    def obs(self) -> Array:
-        return self.clock[:, None].astype(np.float32)
-
-    def step_async(self, actions: Array, active: Any = None) -> None:
-        self.active = np.ones(self.num_envs, bool) if active is None else active
-
-    def step_wait(self) -> Any:
-        n, moving = self.num_envs, self.active & ~self.violation
-        self.clock += moving
-        fate = self.rng.random(n)
-        self.violation |= moving & (fate < 0.1)
-        success, truncated = moving & (fate > 0.9), moving & (self.clock >= self.horizon) & ~self.violation
-        info = {"violation": self.violation.copy(), "success": success}
-        return self.obs, np.where(moving, fate, 0.0), np.zeros(n, bool), truncated, info
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        raise NotImplementedError
-
-
-class Still:
-    def act(self, obs: Array) -> Array:
-        return np.zeros((len(obs), 1), np.float32)
-
-
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("latency", [0, 2])
 def test_the_tally_of_a_running_loop_is_the_summary_of_its_log(seed: int, latency: int) -> None:
     robots, humans, steps = 7, 3, 80
-    team = Team([PolicySupervisor(Still())] * humans, latency=latency)
-    loop = Loop(Clumsy(robots, seed), Still(), parse("C.Random."), team, FleetDAgger(t_teleop=3, t_reset=2), seed=seed)
+    fleet = PointFleet(robots, noise=0.3, goal=0.4, bound=0.6, horizon=6)  # chance decides who falls, arrives, runs late
+    allocator = FleetDAgger(t_teleop=3, t_reset=2)
+    loop = make_loop(fleet, parse("C.Random."), humans, latency=latency, allocator=allocator, seed=seed)
     tally, parts, reward, helped = Tally(robots, humans), [], 0.0, 0
     for t in range(steps):
         if t == steps // 2:  # as in a resumed run

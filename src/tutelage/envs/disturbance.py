@@ -95,7 +95,7 @@ class Pusher:
         self.wrench = np.zeros((num_robots, 6))
 
     def step(self, rng: np.random.Generator, moving: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """The force (N) and torque (N m) on each robot during this timestep, (N, 6); time passes for `moving` robots only."""
+        """Force (N) and torque (N m) on each robot during this timestep, (N, 6); time passes for `moving` robots only."""
         n = len(self.left)
         start = (rng.random(n) < self._rate) & moving
         angle = rng.random(n) * 2 * np.pi

@@ -50,7 +50,7 @@ _mj_contact_forces = types.ExternalFunction("mj_rnePostConstraint", types.void(_
 _memmove = types.ExternalFunction("memmove", _P(_P, _P, types.uintp))
 
 
-@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, cache=True)
 def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-untyped-def]
     """Copy robot i's fields, one behind the other, into row i of the frame (float64)."""
     destination = frame_address + i * frame_width * 8
@@ -59,7 +59,7 @@ def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-u
         destination += sizes[k] * 8
 
 
-@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, cache=True)
 def _advance(  # type: ignore[no-untyped-def]
     robots, models, datas, substeps, forces,
     ctrl_at, ctrl_address, ctrl_width, push_at, push_address, sources, sizes, frame_address, frame_width,
@@ -74,7 +74,7 @@ def _advance(  # type: ignore[no-untyped-def]
         _gather(i, sources, sizes, frame_address, frame_width)
 
 
-@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, cache=True)
 def _restart(  # type: ignore[no-untyped-def]
     robots, models, datas, qpos_at, qpos_address, nq, qvel_at, qvel_address, nv, sources, sizes, frame_address, frame_width
 ):  # fmt: skip
@@ -142,7 +142,10 @@ class Physics:
 
     def _point(self) -> None:
         """Note where each robot's arrays live, once: MuJoCo never moves them."""
-        at = lambda name: np.array([_address(getattr(d, name)) for d in self.datas], dtype=np.intp)  # noqa: E731
+
+        def at(name: str) -> Array:
+            return np.array([_address(getattr(d, name)) for d in self.datas], dtype=np.intp)
+
         self._models_at = np.array([m._address for m in self.models], dtype=np.intp)
         self._datas_at = np.array([d._address for d in self.datas], dtype=np.intp)
         self._ctrl_at, self._qpos_at, self._qvel_at = at("ctrl"), at("qpos"), at("qvel")
@@ -179,16 +182,15 @@ class Physics:
         )  # fmt: skip
 
     def restart(self, robots: Array, qpos: Array, qvel: Array) -> None:
-        """Put the given robots (indices, n of them) at qpos (n, nq) and qvel (n, nv), everything else at its initial value."""
+        """Put the given robots (n indices) at qpos (n, nq) and qvel (n, nv), everything else at its initial value."""
         self._qpos[robots], self._qvel[robots] = qpos, qvel
-        wait(
-            self._spread(
-                _restart, robots,
-                self._models_at, self._datas_at,
-                self._qpos_at, _address(self._qpos), self.model.nq, self._qvel_at, _address(self._qvel), self.model.nv,
-                self._sources, self._sizes, _address(self._frame), self._width,
-            )  # fmt: skip
-        )
+        futures = self._spread(
+            _restart, robots,
+            self._models_at, self._datas_at,
+            self._qpos_at, _address(self._qpos), self.model.nq, self._qvel_at, _address(self._qvel), self.model.nv,
+            self._sources, self._sizes, _address(self._frame), self._width,
+        )  # fmt: skip
+        wait(futures)
 
     def _spread(self, kernel: Any, robots: Array, *arguments: Any) -> list[Future[None]]:
         robots = np.ascontiguousarray(robots, dtype=np.intp)
@@ -210,7 +212,7 @@ class Physics:
         return state
 
     def set_state(self, state: Array) -> None:
-        """Restore what `get_state` returned. `frame` is not refreshed: restore it too (see `MujocoFleet.load_state_dict`)."""
+        """Restore what `get_state` returned. `frame` is not refreshed: restore `raw_frame` too."""
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         for model, data, row in zip(self.models, self.datas, state, strict=True):
             mujoco.mj_setState(model, data, row, spec)

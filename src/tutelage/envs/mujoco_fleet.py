@@ -148,7 +148,7 @@ class MujocoFleet(Fleet):
         }
         return self._obs, reward, self._violation.copy(), truncated, info
 
-    def render(self) -> tuple[Array, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[Array, ...] | None:
         """A picture of every robot, (H, W, 3) uint8 each, when `render_mode` is "rgb_array"."""
         return tuple(self.render_robot(i) for i in range(self.num_envs)) if self.render_mode else None
 
@@ -158,7 +158,8 @@ class MujocoFleet(Fleet):
 
         key = (width, height)
         if key not in self._renderers:
-            self._renderers[key] = Renderer(self.physics.model, width, height)
+            torso = self.physics.model.body(self.task.push_body).id
+            self._renderers[key] = Renderer(self.physics.model, width, height, body=torso)
         return self._renderers[key].picture(self.physics.datas[robot])  # type: ignore[no-any-return]
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -76,7 +76,7 @@ def _context(width: int, height: int) -> Any:
         atexit.register(_close_all)
     except Exception as error:  # PyOpenGL raises AttributeError, ImportError, GLError, ... for the same cause
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise TutelageError(_advice(f"{backend} does not work here ({reason[0].split(". ")[0]})")) from error
+        raise TutelageError(_advice(f"{backend} does not work here ({reason[0].split('. ')[0]})")) from error
     return context
 
 

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tutelage.experiments.report import Run
+    from tutelage.experiments.report import RunRecord
 
 Array = NDArray[Any]
 
-POINTS = 400
-"""Points of a drawn curve: more than a panel has pixels for."""
+POINTS = 250
+"""Points of a drawn curve: about one for each pixel of a panel."""
 
 # fmt: off
 _T95 = (
@@ -76,9 +76,9 @@ def mean_ci(values: Array) -> tuple[Array, Array]:
     return mean, t95(n - 1) * np.std(values, axis=0, ddof=1) / math.sqrt(n)
 
 
-def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def by_label(runs: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
     """The runs of each algorithm, in the order of their first appearance."""
-    groups: dict[str, list[Run]] = {}
+    groups: dict[str, list[RunRecord]] = {}
     for run in runs:
         groups.setdefault(run.label, []).append(run)
     return groups
@@ -106,7 +106,7 @@ PANELS = (
 SPLIT = (("teleoperation", "teleoperation"), ("resetting", "hard resets"), ("waiting", "switching"))
 
 
-def series(run: Run, metric: str) -> tuple[Array, Array]:
+def series(run: RunRecord, metric: str) -> tuple[Array, Array]:
     """A metric of a run over time: timesteps (k,) and values (k,), without gaps. Cumulative metrics start at (0, 0)."""
     if metric == "loss":
         names = sorted(name for name in run.metrics if name.startswith("loss/"))
@@ -129,7 +129,7 @@ def smooth(values: Array, width: int) -> Array:
     return np.asarray((total[high] - total[low]) / (high - low))
 
 
-def band(runs: Sequence[Run], metric: str) -> tuple[Array, Array, Array]:
+def band(runs: Sequence[RunRecord], metric: str) -> tuple[Array, Array, Array]:
     """Timesteps, mean and half width of the 95 % band of a metric over runs, (k,) each; k = 0 where no run has it.
 
     Ends where the shortest run ends: a mean over different runs at different times would jump.
@@ -143,7 +143,7 @@ def band(runs: Sequence[Run], metric: str) -> tuple[Array, Array, Array]:
     return grid, mean, half
 
 
-def heading(runs: Sequence[Run]) -> str:
+def heading(runs: Sequence[RunRecord]) -> str:
     """What all runs have in common, such as "humanoid, 100 robots, 10 humans"."""
     parts = []
     for key, text in (("task", "{}"), ("robots", "{} robots"), ("humans", "{} humans")):
@@ -156,12 +156,13 @@ def heading(runs: Sequence[Run]) -> str:
 # -- drawing ----------------------------------------------------------------------------------------------------------------
 
 
-def curves(runs: Sequence[Run], dark: bool = False) -> Figure:
+def curves(runs: Sequence[RunRecord], dark: bool = False, titled: bool = True) -> Figure:
     """Successes, ROHE, hard resets, idle time, human time and policy loss over time, in 2 x 3 panels.
 
     Args:
         runs: at least one. Runs with the same label become one line with a band.
         dark: light lines on a dark background.
+        titled: with a title; a page may have its own.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -169,6 +170,7 @@ def curves(runs: Sequence[Run], dark: bool = False) -> Figure:
     try:
         from matplotlib import rc_context
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
         from matplotlib.lines import Line2D
         from matplotlib.patches import Patch
     except ImportError:
@@ -176,8 +178,8 @@ def curves(runs: Sequence[Run], dark: bool = False) -> Figure:
     theme = DARK if dark else LIGHT
     groups = by_label(runs)
     with rc_context({"font.family": "sans-serif", "font.size": 9, "text.parse_math": False}):
-        figure = Figure(figsize=(12, 6.9), layout="constrained", facecolor=theme.background)
-        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.08, wspace=0.03, hspace=0.05)  # type: ignore[union-attr]
+        layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08, wspace=0.03, hspace=0.05)
+        figure = Figure(figsize=(12, 6.9), layout=layout, facecolor=theme.background)
         axes = figure.subplots(2, 3)
         end = max(float(run.metrics["t"][-1]) for run in runs)
         for panel, axis in zip(PANELS, axes.flat, strict=True):
@@ -187,18 +189,32 @@ def curves(runs: Sequence[Run], dark: bool = False) -> Figure:
                 for k, group in enumerate(groups.values()):
                     _line(axis, band(group, panel.metric), **_style(theme, k))
             _dress(axis, panel, theme, end, _readable(end))
-        handles = [Line2D([], [], linewidth=2.4, **_style(theme, k)) for k in range(len(groups))]
-        names = [f"{label}  (n = {len(group)})" if len(runs) > 1 else label for label, group in groups.items()]
-        several = any(len(group) > 1 for group in groups.values())
-        if several:
-            handles.append(Patch(facecolor=theme.muted, alpha=0.25, linewidth=0))  # type: ignore[arg-type]
-            names.append("95 % confidence interval of the mean")
-        figure.suptitle(heading(runs), x=0.012, ha="left", fontsize=14, fontweight="bold", color=theme.text)
-        figure.legend(
-            handles, names, loc="outside lower left", ncols=4, frameon=False, fontsize=10,
-            labelcolor=theme.text, handlelength=2.2, columnspacing=2.2,
-        )  # fmt: skip
+        entries: list[tuple[str, Any]] = []
+        if len(groups) > 1:
+            count = "  (n = {})" if len(runs) > len(groups) else ""
+            entries = [
+                (label + count.format(len(group)), Line2D([], [], linewidth=2.4, **_style(theme, k)))
+                for k, (label, group) in enumerate(groups.items())
+            ]
+        if len(runs) > len(groups):
+            entries.append(("95 % confidence interval", Patch(facecolor=theme.muted, alpha=0.25, linewidth=0)))
+        if titled:
+            title = heading(runs) if len(groups) > 1 else ", ".join(filter(None, [heading(runs), next(iter(groups))]))
+            figure.suptitle(title, x=0.012, ha="left", fontsize=14, fontweight="bold", color=theme.text)
+        if entries:
+            columns = min(len(entries), 5)
+            names, handles = zip(*_by_column(entries, columns), strict=True)
+            figure.legend(
+                handles, names, loc="outside lower left", ncols=columns, frameon=False, fontsize=10,
+                labelcolor=theme.text, handlelength=2.2, columnspacing=2,
+            )  # fmt: skip
     return figure
+
+
+def _by_column(entries: list[Any], columns: int) -> list[Any]:
+    """Reorder the entries of a legend, which matplotlib fills column by column, so that they read row by row."""
+    rows = [entries[k : k + columns] for k in range(0, len(entries), columns)]
+    return [row[k] for k in range(columns) for row in rows if k < len(row)]
 
 
 def _style(theme: Theme, k: int) -> dict[str, Any]:
@@ -216,7 +232,7 @@ def _line(axis: Axes, curve: tuple[Array, Array, Array], color: str, linestyle: 
         axis.plot(t, mean, color=color, linestyle=linestyle, linewidth=1.8, solid_capstyle="round")
 
 
-def _split(axis: Axes, run: Run, theme: Theme) -> None:
+def _split(axis: Axes, run: RunRecord, theme: Theme) -> None:
     """Human time of a single run, stacked by what it was spent on, with the names beside the layers."""
     parts = [(name, *series(run, metric)) for metric, name in SPLIT]
     parts = [(name, t, values) for name, t, values in parts if len(t) and values[-1] > 0]
@@ -253,11 +269,16 @@ def _dress(axis: Axes, panel: Panel, theme: Theme, end: float, label: Callable[.
             0.5, 0.5, "not recorded", transform=axis.transAxes, ha="center", va="center", color=theme.muted, fontsize=10
         )
         return
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in axis.lines] or [np.empty(0)])
-    if panel.metric == "loss" and len(values) and values.min() > 0 and values.max() > 20 * values.min():
+    # The lines decide what is shown; the band of two or three runs may be many times as high.
+    lines = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in axis.lines] or [np.empty(0)])
+    if panel.metric == "loss" and lines.min() > 0 and lines.max() > 20 * lines.min():
         axis.set_yscale("log")
+        axis.set_ylim(lines.min() / 2, lines.max() * 2)
+        axis.yaxis.set_major_formatter("{x:g}")  # powers of ten would need mathematical text
+        axis.yaxis.set_minor_formatter("")
+        axis.tick_params(which="minor", length=0)
         return
-    top = axis.dataLim.y1
+    top = min(axis.dataLim.y1, 1.5 * lines.max()) if len(lines) else axis.dataLim.y1
     axis.set_ylim(0, top * 1.05 if top > 0 else 1)
     axis.locator_params(axis="y", nbins=5, integer=panel.metric not in ("rohe", "loss"))
     axis.yaxis.set_major_formatter(_readable(top))
@@ -265,11 +286,12 @@ def _dress(axis: Axes, panel: Panel, theme: Theme, end: float, label: Callable[.
 
 def _readable(top: float) -> Callable[..., str]:
     """A tick formatter: 12,000 as 12k, and no digits that the axis does not need."""
-    if top >= 10_000_000:
-        return lambda value, _=None: f"{value / 1e6:g}M"
-    if top >= 10_000:
-        return lambda value, _=None: f"{value / 1e3:g}k" if value else "0"
-    return lambda value, _=None: f"{value:,g}" if abs(value) < 1000 else f"{value:,.0f}"
+    scale, suffix = (1e6, "M") if top >= 10_000_000 else (1e3, "k") if top >= 10_000 else (1, "")
+
+    def text(value: float, position: int | None = None) -> str:
+        return f"{value / scale:,.6g}{suffix if value else ''}"
+
+    return text
 
 
 def render(figure: Figure, form: str) -> bytes:

@@ -73,6 +73,10 @@ class Loop:
 
         n = fleet.num_envs
         self.t = 0
+        self.in_step = False
+        """Whether a timestep has begun and not ended: then the state is not one to save."""
+        self.stop_requested = False
+        """Set it to end the run after the present timestep."""
         self.rng = stream(seed, "loop/ties")
         self.mode = np.full(n, Mode.AUTONOMOUS, dtype=np.int8)
         self.age = np.zeros(n, dtype=np.int64)
@@ -87,7 +91,7 @@ class Loop:
         for subscriber in self.subscribers:
             subscriber.on_start(self)
         try:
-            while self.t < steps:
+            while self.t < steps and not self.stop_requested:
                 step = self.step()
                 for subscriber in self.subscribers:
                     subscriber.on_step(self, step)
@@ -97,7 +101,7 @@ class Loop:
 
     def step(self) -> Step:
         """One timestep of all robots."""
-        self.journal.t = self.t
+        self.journal.t, self.in_step = self.t, True
         view = self._observe()
         self._allocate(self.priority(view))
         actions, mode, human = self._act(view), self.mode.copy(), self.human_of
@@ -119,6 +123,7 @@ class Loop:
             if not self.overlap:
                 losses.update(self.learner.update(self.t))
         self.t += 1
+        self.in_step = False
         return step
 
     @property

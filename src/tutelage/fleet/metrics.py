@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from tutelage.errors import ContractError
 from tutelage.fleet.events import Events
 from tutelage.fleet.modes import END_OF_STEP, HELPED, IDLE, TABLE, Event, Mode
 from tutelage.fleet.step import Step
+
+if TYPE_CHECKING:
+    from tutelage.fleet.loop import Loop
 
 Array = NDArray[Any]
 
@@ -432,3 +435,20 @@ class Tally:
         for name in ("events", "time"):
             setattr(self, name, state[name].copy())
         self._mode, self._broken = state["mode"].copy(), state["broken"].copy()
+
+
+class Counting:
+    """A subscriber that keeps a tally."""
+
+    def __init__(self, tally: Tally) -> None:
+        self.tally = tally
+
+    def on_start(self, loop: Loop) -> None:
+        """Nothing to do."""
+
+    def on_step(self, loop: Loop, step: Step) -> None:
+        """Count the step."""
+        self.tally.update(step)
+
+    def on_end(self, loop: Loop) -> None:
+        """Nothing to do."""

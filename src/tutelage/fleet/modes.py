@@ -22,7 +22,7 @@ class Mode(IntEnum):
     AUTONOMOUS = 0
     """Executes its own policy."""
     SWITCHING = 1
-    """A human is assigned and on the way (switching latency L, or a person who has not accepted yet); the robot is paused."""
+    """A human is assigned and on the way (switching latency L, or a person who has not accepted yet); it is paused."""
     TELEOPERATED = 2
     """Executes the human's actions."""
     VIOLATED = 3

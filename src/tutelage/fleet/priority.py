@@ -51,7 +51,8 @@ class PriorityConfig:
         risk: r-hat, likewise; None: from `risk_quantile`.
         uncertainty_quantile: quantile of the uncertainty over the policy's own first steps that becomes u-hat.
         risk_quantile: likewise for r-hat.
-        initial: t_I, timesteps at the start during which constraint violations have no priority (C.U.R.).
+        initial: t_I, timesteps at the start during which constraint violations have no priority; None: what the
+            task and the priority decide (only C.U.R. has such a period).
         combined: threshold of the combined score of U.G.
         goal_weight: weight of the goal term in the combined score of U.G.
         random: threshold of Random: a score in [0, 1) at or below it counts as 0.
@@ -61,7 +62,7 @@ class PriorityConfig:
     risk: float | None = None
     uncertainty_quantile: float = 0.9
     risk_quantile: float = 0.9
-    initial: int = 0
+    initial: int | None = None
     combined: float = 3.25
     goal_weight: float = 0.25
     random: float = 0.9
@@ -74,7 +75,7 @@ class PriorityConfig:
         for name in ("uncertainty_quantile", "risk_quantile"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
-        if self.initial < 0:
+        if self.initial is not None and self.initial < 0:
             raise ConfigError(f"initial (t_I) must be >= 0 timesteps, got {self.initial}")
 
 
@@ -84,7 +85,7 @@ class Constraint:
     needs: tuple[str, ...] = ()
 
     def __init__(self, config: PriorityConfig) -> None:
-        self.initial = config.initial
+        self.initial = config.initial or 0
 
     def __call__(self, view: FleetView) -> Array:
         return view.violation * float(view.t >= self.initial)

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from tutelage.errors import ConfigError
 from tutelage.fleet.policy import Policy
-from tutelage.learning.optimiser import adam, load_module_state, load_optimiser_state, module_state, optimiser_state
+from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.mlp import BatchedMLP
+from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import rng_state, set_rng_state
 
 Array = NDArray[Any]
@@ -137,8 +138,9 @@ class Critic:
 
     def __call__(self, obs: Array, actions: Array) -> Array:
         """Q(s, a) of each robot: (N, D), (N, A) -> (N,) in [0, 1]."""
+        s, a = (torch.from_numpy(np.asarray(x, np.float32)) for x in (obs, actions))
         with torch.no_grad():
-            q = self._q(self.net, torch.from_numpy(np.asarray(obs, np.float32)), torch.from_numpy(np.asarray(actions, np.float32)))
+            q = self._q(self.net, s, a)
         return self.worst(q).numpy()  # type: ignore[no-any-return]
 
     def add(self, obs: Array, action: Array, next_obs: Array, event: Array, end: Array) -> None:

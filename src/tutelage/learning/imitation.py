@@ -14,9 +14,10 @@ from tutelage.fleet.modes import MOVING, Mode
 from tutelage.fleet.step import Step
 from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
-from tutelage.learning.optimiser import adam, load_module_state, load_optimiser_state, module_state, optimiser_state
+from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.policies.mlp import BatchedMLP
+from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import derive
 
 Array = NDArray[Any]

@@ -25,13 +25,3 @@ def load_optimiser_state(optimiser: torch.optim.Optimizer, state: dict[str, Any]
     whole = optimiser.state_dict()
     whole["state"] = {int(i): {k: torch.from_numpy(v.copy()) for k, v in m.items()} for i, m in state.items()}
     optimiser.load_state_dict(whole)
-
-
-def module_state(module: torch.nn.Module) -> dict[str, Any]:
-    """All parameters and buffers as arrays (copies)."""
-    return {name: p.detach().clone().numpy() for name, p in module.state_dict().items()}
-
-
-def load_module_state(module: torch.nn.Module, state: dict[str, Any]) -> None:
-    """Restore what `module_state` returned."""
-    module.load_state_dict({name: torch.from_numpy(p.copy()) for name, p in state.items()})

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tutelage.fleet.fleet import Fleet
+from tutelage.learning.optimiser import load_optimiser_state, optimiser_state
 from tutelage.policies.expert import GaussianActor, tanh_mlp
+from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import derive, rng_state, set_rng_state, stream
 from tutelage.store import load_tree, save_tree
 
@@ -96,7 +98,7 @@ class PPO:
         self._discounted = np.zeros(fleet.num_envs)
         self._obs, _ = fleet.reset(seed=derive(seed, "ppo/fleet") % 2**32)
         self._returns = np.zeros(fleet.num_envs)
-        self.finished: list[tuple[float, bool]] = []
+        self.finished: list[tuple[float, float]] = []
         """(return, survived) of the episodes that ended in the last rollout."""
 
     def iterate(self) -> dict[str, float]:
@@ -124,7 +126,7 @@ class PPO:
             self._returns += reward
             self._discounted[done] = 0.0
             if done.any():
-                self.finished += list(zip(self._returns[done].tolist(), truncated[done].tolist(), strict=True))
+                self.finished += list(zip(self._returns[done].tolist(), truncated[done].astype(float).tolist(), strict=True))
                 self._returns[done] = 0.0
                 obs, _ = self.fleet.reset(options={"reset_mask": done})
             self._obs = obs
@@ -194,16 +196,15 @@ class PPO:
 
     def save(self, path: Path) -> None:
         """Write everything needed to go on: weights, optimiser, statistics, random state, physics."""
-        optimiser = self.optimiser.state_dict()["state"]
         save_tree(
             path,
             {
                 "config": asdict(self.config),
                 "steps": self.steps,
                 "learning_rate": self.learning_rate,
-                "actor": {k: v.numpy() for k, v in self.actor.state_dict().items()},
-                "critic": {k: v.numpy() for k, v in self.critic.state_dict().items()},
-                "adam": {str(i): {k: np.asarray(v.numpy()) for k, v in s.items()} for i, s in optimiser.items()},
+                "actor": module_state(self.actor),
+                "critic": module_state(self.critic),
+                "adam": optimiser_state(self.optimiser),
                 "moments": {
                     name: {"count": m.count, "mean": m.mean, "m2": m.m2}
                     for name, m in (("obs", self.obs_moments), ("return", self.return_moments))
@@ -219,13 +220,11 @@ class PPO:
         """Go on from what `save` wrote."""
         tree = load_tree(path)
         self.steps, self.learning_rate = tree["steps"], tree["learning_rate"]
-        self.actor.load_state_dict({k: torch.from_numpy(v) for k, v in tree["actor"].items()})
-        self.critic.load_state_dict({k: torch.from_numpy(v) for k, v in tree["critic"].items()})
-        adam = self.optimiser.state_dict()
-        for group in adam["param_groups"]:
+        load_module_state(self.actor, tree["actor"])
+        load_module_state(self.critic, tree["critic"])
+        load_optimiser_state(self.optimiser, tree["adam"])
+        for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
-        adam["state"] = {int(i): {k: torch.from_numpy(v) for k, v in s.items()} for i, s in tree["adam"].items()}
-        self.optimiser.load_state_dict(adam)
         for name, m in (("obs", self.obs_moments), ("return", self.return_moments)):
             saved = tree["moments"][name]
             m.count, m.mean, m.m2 = saved["count"], saved["mean"], saved["m2"]

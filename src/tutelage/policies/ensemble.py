@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from tutelage.errors import ContractError
 from tutelage.policies.mlp import BatchedMLP
+from tutelage.policies.weights import load_module_state, load_weights, save_policy
 
 Array = NDArray[Any]
 
@@ -51,6 +54,27 @@ class EnsemblePolicy(nn.Module):
         self.register_buffer("obs_std", torch.ones(obs_width))
         self._seen: Array | None = None
         self._said = torch.empty(0)
+
+    def save(self, path: Path, card: dict[str, Any]) -> None:
+        """Write weights and a card (JSON values) as safetensors."""
+        save_policy(path, self, {**card, "hidden": [w.shape[2] for w in self.net.weights][:-1]})
+
+    @classmethod
+    def load(cls, path: Path) -> tuple[EnsemblePolicy, dict[str, Any]]:
+        """Read weights and card.
+
+        Raises:
+            TutelageError: no such file, or a damaged one.
+            ContractError: the file holds something else.
+        """
+        weights, card = load_weights(path, cls.__name__)
+        try:
+            middle, half, first = weights["action_middle"], weights["action_half"], weights["net.weights.0"]
+            policy = cls(first.shape[1], middle - half, middle + half, members=len(first), hidden=tuple(card["hidden"]))
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError):
+            raise ContractError(f"{path} lacks the shapes of an ensemble on its card") from None
+        load_module_state(policy, weights)
+        return policy, card
 
     def set_normalisation(self, obs: Array) -> None:
         """Z-score inputs with the mean and standard deviation of obs (n, D), from now on."""

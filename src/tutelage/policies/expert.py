@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tutelage.errors import ContractError
-from tutelage.store import load_tree, save_tree
+from tutelage.policies.weights import load_module_state, load_weights, save_policy
 
 Array = NDArray[Any]
 
@@ -66,8 +66,7 @@ class GaussianActor(nn.Module):
 
     def save(self, path: Path, card: dict[str, Any]) -> None:
         """Write weights and their card (task, command, seed, steps, scores) as safetensors."""
-        weights = {name.replace(".", "_"): p.detach().numpy() for name, p in self.state_dict().items()}
-        save_tree(path, {"weights": weights, "card": {**card, "features": self.features, "hidden": list(self.hidden)}})
+        save_policy(path, self, {**card, "features": self.features, "hidden": list(self.hidden)})
 
     @classmethod
     def load(cls, path: Path) -> tuple[GaussianActor, dict[str, Any]]:
@@ -75,16 +74,14 @@ class GaussianActor(nn.Module):
 
         Raises:
             TutelageError: no such file, or a damaged one.
-            ContractError: the weights do not fit the shapes on the card.
+            ContractError: the file holds something else, or its weights do not fit the shapes on its card.
         """
-        tree = load_tree(path)
+        weights, card = load_weights(path, cls.__name__)
         try:
-            weights, card = tree["weights"], tree["card"]
-            actor = cls(card["features"], weights["low"], weights["high"], tuple(card["hidden"]))
-            own = actor.state_dict()
-            actor.load_state_dict({name: torch.from_numpy(weights[name.replace(".", "_")]) for name in own})
-        except (KeyError, RuntimeError, TypeError) as error:
-            raise ContractError(f"{path} does not hold an expert's weights: {str(error).splitlines()[0]}") from None
+            actor = cls(int(card["features"]), weights["low"], weights["high"], tuple(card["hidden"]))
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError):
+            raise ContractError(f"{path} lacks the shapes of an actor on its card") from None
+        load_module_state(actor, weights)
         return actor, card
 
 

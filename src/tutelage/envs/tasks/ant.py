@@ -15,6 +15,7 @@ class Ant(MujocoTask):
     fields = ("qpos", "qvel", "cfrc_ext", "xpos")
     contact_forces = True
     expert_features = 27
+    disturbance = "moderate"
     summary = "a quadruped walks forward; violation: torso below 0.2 m or above 1 m"
 
     def observe(self, frame: Frame) -> Array:
@@ -26,7 +27,7 @@ class Ant(MujocoTask):
 
     def reward(self, frame: Frame, velocity: Array, actions: Array) -> Array:
         contact = 5e-4 * np.square(np.clip(frame["cfrc_ext"], -1.0, 1.0)).sum(axis=(1, 2))
-        return velocity + ~self.violation(frame) - 0.5 * np.square(actions).sum(axis=1) - contact
+        return velocity + ~self.violation(frame) - 0.5 * np.square(actions).sum(axis=1) - contact  # type: ignore[no-any-return]
 
     def violation(self, frame: Frame) -> NDArray[np.bool_]:
         z = frame["qpos"][:, 2]

@@ -12,6 +12,7 @@ class HalfCheetah(MujocoTask):
     """17 observations, 6 actions. Gymnasium never ends an episode; here a torso beyond 90 degrees is a violation."""
 
     name, xml, frame_skip, planar = "HalfCheetah", "half_cheetah.xml", 5, True
+    disturbance = "moderate"
     summary = "a planar cheetah runs forward; violation: tipped over (|pitch| > 90 degrees)"
 
     def observe(self, frame: Frame) -> Array:
@@ -21,7 +22,7 @@ class HalfCheetah(MujocoTask):
         return frame["qpos"][:, 0].copy()
 
     def reward(self, frame: Frame, velocity: Array, actions: Array) -> Array:
-        return velocity - 0.1 * np.square(actions).sum(axis=1)
+        return velocity - 0.1 * np.square(actions).sum(axis=1)  # type: ignore[no-any-return]
 
     def violation(self, frame: Frame) -> NDArray[np.bool_]:
         return np.abs(frame["qpos"][:, 2]) > np.pi / 2

@@ -15,6 +15,7 @@ class Humanoid(MujocoTask):
     fields = ("qpos", "qvel", "cinert", "cvel", "qfrc_actuator", "cfrc_ext", "xipos", "ctrl")
     contact_forces = True
     expert_features = 45
+    disturbance = "moderate"
     summary = "a humanoid walks forward; violation: torso below 1 m or above 2 m"
 
     def observe(self, frame: Frame) -> Array:
@@ -32,12 +33,12 @@ class Humanoid(MujocoTask):
         )
 
     def forward(self, frame: Frame, body_mass: Array) -> Array:
-        return (frame["xipos"][:, :, 0] * body_mass).sum(axis=1) / body_mass.sum(axis=1)
+        return (frame["xipos"][:, :, 0] * body_mass).sum(axis=1) / body_mass.sum(axis=1)  # type: ignore[no-any-return]
 
     def reward(self, frame: Frame, velocity: Array, actions: Array) -> Array:
         control = 0.1 * np.square(frame["ctrl"]).sum(axis=1)
         contact = np.minimum(5e-7 * np.square(frame["cfrc_ext"]).sum(axis=(1, 2)), 10.0)
-        return 1.25 * velocity + 5.0 * ~self.violation(frame) - control - contact
+        return 1.25 * velocity + 5.0 * ~self.violation(frame) - control - contact  # type: ignore[no-any-return]
 
     def violation(self, frame: Frame) -> NDArray[np.bool_]:
         z = frame["qpos"][:, 2]

@@ -12,6 +12,7 @@ class Walker2d(MujocoTask):
     """17 observations, 6 actions. Violation: torso height outside (0.8, 2.0) m or pitch outside (-1, 1) rad."""
 
     name, xml, frame_skip, planar = "Walker2d", "walker2d_v5.xml", 4, True
+    disturbance = "moderate"
     summary = "a planar biped walks forward; violation: fallen (height or pitch of the torso)"
 
     def observe(self, frame: Frame) -> Array:
@@ -21,7 +22,7 @@ class Walker2d(MujocoTask):
         return frame["qpos"][:, 0].copy()
 
     def reward(self, frame: Frame, velocity: Array, actions: Array) -> Array:
-        return velocity + ~self.violation(frame) - 1e-3 * np.square(actions).sum(axis=1)
+        return velocity + ~self.violation(frame) - 1e-3 * np.square(actions).sum(axis=1)  # type: ignore[no-any-return]
 
     def violation(self, frame: Frame) -> NDArray[np.bool_]:
         z, pitch = frame["qpos"][:, 1], frame["qpos"][:, 2]

@@ -1,0 +1,257 @@
+"""The command line: verbs only. Each verb is a function or a configuration of the library; `--help` is its documentation."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from tutelage import __version__
+from tutelage.errors import ConfigError, TutelageError
+from tutelage.experiments.config import RunConfig
+from tutelage.experiments.train_expert import ExpertConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tutelage.experiments.run import Run
+    from tutelage.fleet.loop import Loop
+
+console = Console()
+
+
+def run(config: Annotated[RunConfig, arg(name="")]) -> None:
+    """Interactive fleet learning with algorithmic supervisors; leaves a run folder that can be continued."""
+    from tutelage.experiments.run import Run
+
+    with console.status(f"preparing {config.folder}") as status:
+        prepared = Run.start(config, lambda what, done: status.update(f"{what} {done:.0%}" if done else what))
+    _go(prepared)
+
+
+def resume(folder: Positional[Path]) -> None:
+    """Continue a run from its last checkpoint, as if it had never stopped.
+
+    Args:
+        folder: the run folder.
+    """
+    from tutelage.experiments.run import Run
+
+    with console.status(f"loading {folder}"):
+        continued = Run.resume(folder)
+    if continued.loop.t >= continued.config.steps:
+        console.print(f"{folder} is complete at timestep {continued.loop.t}; nothing to do")
+        return
+    console.print(f"continuing at timestep {continued.loop.t} of {continued.config.steps}")
+    _go(continued)
+
+
+def evaluate(
+    folder: Positional[Path],
+    steps: int = 10_000,
+    priority: str = "C.",
+    expert: bool = False,
+) -> None:
+    """A frozen policy at work, alone or with help (table C.2); writes evaluation.json into the run folder.
+
+    Args:
+        folder: the run folder whose policy is evaluated.
+        steps: timesteps.
+        priority: who gets help: "C." gives hard resets only, "U.C." also teleoperation of uncertain robots.
+        expert: evaluate the algorithmic supervisor itself, for reference.
+    """
+    from tutelage.experiments.evaluate import evaluate_run
+    from tutelage.experiments.progress import ProgressDisplay
+    from tutelage.experiments.run import read_config
+    from tutelage.fleet.metrics import Tally
+
+    config = read_config(folder)
+    tally = Tally(config.robots, config.humans)
+    display = ProgressDisplay(f"evaluating {folder.name}", steps, tally, console)
+    result = evaluate_run(folder, steps, priority, expert, tally, [display])
+    _print_metrics(result)
+
+
+def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
+    """Curves, tables and one self-contained HTML page of one run, or of many with means and 95 % bands.
+
+    Args:
+        runs: run folders.
+        out: where the page goes; default: report.html in the only run, or in the folder that holds them all.
+    """
+    from tutelage.experiments.report import load_runs, summary_table, write_report
+
+    if not runs:
+        raise ConfigError("name at least one run folder, such as: tutelage report runs/*")
+    console.print(summary_table(load_runs(runs)), highlight=False, markup=False, soft_wrap=True)
+    page = write_report(runs, out or (runs[0] if len(runs) == 1 else runs[0].parent))
+    console.print(f"report: {page}", highlight=False, soft_wrap=True)
+
+
+def train_expert(config: Annotated[ExpertConfig, arg(name="")]) -> None:
+    """Train an algorithmic supervisor by PPO; resumable, scored over 100 episodes."""
+    from tutelage.experiments.train_expert import train
+
+    train(config, lambda line: console.print(line, highlight=False, soft_wrap=True))
+
+
+def check(
+    kind: Positional[Literal["env", "policy", "priority", "supervisor"]],
+    name: Positional[str],
+    task: str = "Walker2d",
+) -> None:
+    """Does a class of yours keep the contract? Names the first broken clause, if any.
+
+    Args:
+        kind: what it is.
+        name: module:callable that makes it; an env is made as callable(num_envs), the others without arguments. For
+            env also the name of a task, for priority also a string such as C.U.R.
+        task: the fleet on which policies, priorities and supervisors are tried.
+    """
+    from tutelage import checks
+    from tutelage.envs.registry import load_object, make_fleet
+    from tutelage.fleet.priority import parse
+
+    fleet = make_fleet(name if kind == "env" else task, 4)
+    if kind == "env":
+        checks.check_env(fleet)
+    elif kind == "priority":
+        checks.check_priority(load_object(name, kind)() if ":" in name else parse(name), fleet)
+    elif kind == "policy":
+        checks.check_policy(load_object(name, kind)(), fleet)
+    else:
+        checks.check_supervisor(load_object(name, kind)(), fleet)
+    fleet.close()
+    console.print(f"{name} keeps the contract of a {kind}", highlight=False)
+
+
+def info(what: Positional[Literal["tasks", "levels", "priorities", "version"]] = "tasks") -> None:
+    """What there is: tasks with sizes and experts, levels of disturbance, priority functions.
+
+    Args:
+        what: which list.
+    """
+    if what == "version":
+        from tutelage.experiments.run import environment
+
+        console.print(environment().rstrip(), highlight=False)
+    elif what == "levels":
+        from dataclasses import asdict
+
+        from tutelage.envs.disturbance import LEVELS
+
+        rows = [[name, *(f"{value:g}" for value in asdict(level).values())] for name, level in LEVELS.items()]
+        _print_table(["level", *asdict(LEVELS["none"])], rows)
+    elif what == "priorities":
+        from tutelage.fleet.priority import TERMS, UncertaintyGoal
+
+        terms = {**TERMS, "U.G": UncertaintyGoal}
+        _print_table(["term", "meaning"], [[n, (t.__doc__ or "").split(": ", 1)[-1].splitlines()[0]] for n, t in terms.items()])
+    else:
+        from tutelage.envs.mujoco_fleet import MujocoFleet
+        from tutelage.envs.tasks import TASKS
+
+        rows = []
+        for name, task in TASKS.items():
+            fleet = MujocoFleet(name, 1, threads=1)
+            sizes = [str(fleet.single_observation_space.shape[0]), str(len(fleet.action_low)), str(task.horizon)]  # type: ignore[index]
+            rows.append([name, *sizes, task.disturbance, *_supervisor(name, task.disturbance), task.summary])
+            fleet.close()
+        head = ["task", "obs", "actions", "horizon", "level", "supervisor", "return in calm", "success at level", "what"]
+        _print_table(head, rows)
+
+
+def _supervisor(task: str, level: str) -> list[str]:
+    from tutelage.envs import experts
+
+    if not experts.path_of(task).exists():
+        return ["none yet", "", ""]
+    card = experts.load(task)[1]
+    calm, here = card["scores"]["none"], card["scores"].get(level)
+    kind = "expert" if experts.is_expert(card) else "short of expert"
+    return [
+        kind,
+        f"{calm['mean']:.0f} (published {experts.PUBLISHED[task]:.0f})",
+        f"{here['success']:.0%} of {here['episodes']}" if here else "",
+    ]
+
+
+def _go(prepared: Run) -> None:
+    """Run with a progress display and plots; Ctrl-C ends it after the present timestep, with nothing lost."""
+    from tutelage.experiments.live import LivePlots
+    from tutelage.experiments.progress import ProgressDisplay
+
+    c = prepared.config
+    display = ProgressDisplay(f"{c.task} {c.algorithm}", c.steps, prepared.recorder.tally, console)
+    with _interruptible(prepared.loop):
+        metrics = prepared.run([display, LivePlots(prepared.folder)])
+    if prepared.loop.t < c.steps:
+        console.print(f"stopped at timestep {prepared.loop.t}; continue with: tutelage resume {prepared.folder}", soft_wrap=True)
+    else:
+        _print_metrics(metrics)
+    console.print(f"run folder: {prepared.folder}   plots: {prepared.folder / 'plots'}", highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _interruptible(loop: Loop) -> Iterator[None]:
+    """The first Ctrl-C asks the loop to stop, the second one insists."""
+
+    def ask(number: int, frame: Any) -> None:
+        loop.stop_requested = True
+        signal.signal(number, signal.default_int_handler)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _print_metrics(metrics: dict[str, Any]) -> None:
+    rows = [[name, f"{value:,.2f}" if isinstance(value, float) and value % 1 else f"{value:,}" if not isinstance(value, str) else value]
+            for name, value in metrics.items()]  # fmt: skip
+    _print_table(["metric", "value"], rows)
+
+
+def _print_table(head: list[str], rows: list[list[str]]) -> None:
+    table = Table(box=None, header_style="bold")
+    for name in head:
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table, highlight=False)
+
+
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of `tutelage`: exits with 0, or with 2 and one clear line."""
+    verbs: dict[str, Any] = {
+        "run": run,
+        "resume": resume,
+        "evaluate": evaluate,
+        "report": report,
+        "train-expert": train_expert,
+        "check": check,
+        "info": info,
+    }
+    arguments = list(sys.argv[1:] if args is None else args)
+    if arguments == ["--version"]:
+        print(f"tutelage {__version__}")
+        return
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            verbs, prog="tutelage", args=arguments, description="Supervised autonomy for robot fleets."
+        )
+    except TutelageError as error:
+        print(f"tutelage: {error}", file=sys.stderr)
+        raise SystemExit(2) from None

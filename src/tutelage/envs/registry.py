@@ -1,0 +1,118 @@
+"""Tasks by name: the one way from a string to a fleet."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from tutelage.envs.disturbance import Disturbance
+from tutelage.envs.tasks import TASKS
+from tutelage.envs.tasks.base import MujocoTask
+from tutelage.errors import ConfigError, ContractError
+from tutelage.fleet.fleet import Fleet
+
+GROUP = "tutelage.tasks"
+"""Entry points of this group are tasks. Each names what "module:callable" may name; see `make_fleet`."""
+
+
+def task_names() -> list[str]:
+    """The tasks that `make_fleet` knows by name: built in, and of installed packages."""
+    return [*TASKS, *(name for name in _installed() if name not in TASKS)]
+
+
+def make_fleet(
+    task: str,
+    num_envs: int,
+    *,
+    disturbance: Disturbance | str | None = None,
+    threads: int | None = None,
+    **kwargs: Any,
+) -> Fleet:
+    """A fleet of `num_envs` robots.
+
+    Args:
+        task: a built-in task ("Walker2d"), the name of an entry point of the group "tutelage.tasks", or
+            "module:callable". The callable is a subclass of `MujocoTask`, or is called as
+            `callable(num_envs, **kwargs)` and returns a `Fleet`.
+        num_envs: N robots.
+        disturbance: for the MuJoCo tasks, see `MujocoFleet`. Handed to a callable only when given, like `threads`.
+        threads: physics threads.
+        kwargs: further arguments of the fleet, such as `success_return`.
+
+    Raises:
+        ConfigError: an unknown task, or arguments that it does not take.
+        ContractError: the callable returned something that is no `Fleet`.
+    """
+    given = {"disturbance": disturbance, "threads": threads}
+    settings = {name: value for name, value in given.items() if value is not None} | kwargs
+    make: Any = find_task(task)
+    if isinstance(make, type) and issubclass(make, MujocoTask):
+        from tutelage.envs.mujoco_fleet import MujocoFleet
+
+        _fits(MujocoFleet, task, make, num_envs, settings=settings)
+        return MujocoFleet(make(), num_envs, **settings)
+    _fits(make, task, num_envs, settings=settings)
+    fleet = make(num_envs, **settings)
+    if not isinstance(fleet, Fleet):
+        raise ContractError(f"task {task!r} must return a tutelage.fleet.fleet.Fleet, got {type(fleet).__name__}")
+    return fleet
+
+
+def find_task(task: str) -> Callable[..., Any]:
+    """What makes the fleets of a task.
+
+    Raises:
+        ConfigError: an unknown task.
+    """
+    if task in TASKS:
+        return TASKS[task]
+    if ":" in task:
+        return load_object(task, "task")
+    installed = _installed()
+    if task in installed:
+        return load_object(f"{installed[task].module}:{installed[task].attr}", "task")
+    names = task_names()
+    close = difflib.get_close_matches(task.lower(), [name.lower() for name in names])
+    meant = [name for name in names if name.lower() in close]
+    hint = f" (did you mean {' or '.join(meant)}?)" if meant else ""
+    raise ConfigError(f"unknown task {task!r}{hint}; tasks: {', '.join(names)}, or your own as module:callable")
+
+
+def _installed() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def load_object(name: str, what: str) -> Callable[..., Any]:
+    """The callable that "module:callable" names. `what` says in errors what it is for ("task").
+
+    Raises:
+        ConfigError: no such module, or no such callable in it.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        found: Any = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # the module exists, and something that it imports does not
+        raise ConfigError(f"{what} {name!r}: no module {error.name!r}; install it, or run where Python finds it") from None
+    except ValueError:  # an empty or relative name
+        raise ConfigError(f"{what} {name!r}: write module:callable, such as my_package.robots:make_fleet") from None
+    for part in attribute.split("."):
+        found = getattr(found, part, None)
+    if not callable(found):
+        raise ConfigError(f"{what} {name!r}: module {module!r} has no callable {attribute!r}")
+    return found  # type: ignore[no-any-return]
+
+
+def _fits(make: Callable[..., Any], task: str, *arguments: Any, settings: dict[str, Any]) -> None:
+    """Refuse settings that the callable does not take, before it runs, so that its own TypeErrors stay its own."""
+    try:
+        inspect.signature(make).bind(*arguments, **settings)
+    except TypeError as error:
+        raise ConfigError(f"task {task!r} cannot be made with {sorted(settings)}: {error}") from None
+    except ValueError:  # a callable without a signature, such as one written in C
+        return

@@ -1,0 +1,210 @@
+"""From a configuration to a loop that is ready to run: fleet, humans, demonstrations, policy, critics, thresholds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tutelage.envs import experts
+from tutelage.envs.registry import find_task, load_object, make_fleet
+from tutelage.envs.tasks import TASKS
+from tutelage.errors import ConfigError, ContractError
+from tutelage.experiments.config import RunConfig
+from tutelage.fleet.allocation import FleetDAgger
+from tutelage.fleet.fleet import Fleet
+from tutelage.fleet.loop import Loop
+from tutelage.fleet.policy import Policy
+from tutelage.fleet.priority import parse
+from tutelage.fleet.supervisor import NoisySupervisor, PolicySupervisor, Supervisor, Team
+from tutelage.learning.critic import Critic
+from tutelage.learning.dataset import AggregatedDataset
+from tutelage.learning.imitation import ImitationLearner
+from tutelage.policies.ensemble import EnsemblePolicy
+from tutelage.seeding import derive, stream
+
+Array = NDArray[Any]
+Report = Callable[[str, float], None]
+"""Told what is being prepared, and how much of it is done (0 to 1)."""
+
+INITIAL_PERIOD = {"Humanoid": 1000, "Walker2d": 250, "Ant": 250, "HalfCheetah": 250}
+"""t_I of C.U.R. a task; the dissertation's for Humanoid (table C.1), its Anymal's for the other walkers."""
+
+
+@dataclass
+class Assembly:
+    """The parts of a run, before anything is learned."""
+
+    config: RunConfig
+    fleet: Fleet
+    actor: Policy
+    policy: EnsemblePolicy
+    learner: ImitationLearner
+
+    def loop(self) -> Loop:
+        """The loop over these parts; thresholds must be resolved."""
+        c = self.config
+        priority = parse(c.priority, c.thresholds)
+        critics = self.learner.critics
+        if "goal" in priority.needs and not self.fleet.goal_conditioned:
+            raise ConfigError(f"{c.priority} needs a task with a goal, and {c.task} has none; use C.U.R. or U.C.")
+        supervisor: Supervisor = PolicySupervisor(self.actor)
+        if c.supervisor_noise:
+            sigma = c.supervisor_noise * float((self.fleet.action_high - self.fleet.action_low).mean() / 2)
+            supervisor = NoisySupervisor(supervisor, sigma, stream(c.seed, "supervisor noise"))
+        return Loop(
+            self.fleet,
+            self.policy,
+            priority,
+            Team([supervisor] * c.humans, c.latency),
+            FleetDAgger(c.t_teleop, c.t_reset),
+            self.learner,
+            {name: lambda view, critic=critic: critic(view.obs, view.actions) for name, critic in critics.items()},
+            overlap=c.overlap,
+            seed=c.seed,
+        )
+
+
+def assemble(config: RunConfig) -> Assembly:
+    """Make the parts of a run. Nothing is trained yet.
+
+    Raises:
+        ConfigError: an unknown task, level or priority, or a combination that cannot work.
+    """
+    torch.set_num_threads(config.torch_threads)
+    find_task(config.task)
+    config = _resolve_defaults(config)
+    priority = parse(config.priority, config.thresholds)
+    actor = _expert(config)
+    options: dict[str, Any] = {"disturbance": config.disturbance}
+    if config.task in TASKS:
+        assert config.disturbance is not None
+        options["success_return"] = experts.success_return(config.task, config.disturbance, threads=config.threads)
+    fleet = make_fleet(config.task, config.robots, threads=config.threads, **options)
+
+    width = fleet.single_observation_space.shape[0]  # type: ignore[index]
+    actions = len(fleet.action_low)
+    policy = EnsemblePolicy(
+        width, fleet.action_low, fleet.action_high,
+        members=config.members, hidden=config.hidden, seed=derive(config.seed, "policy/initial weights"),
+    )  # fmt: skip
+    dataset = AggregatedDataset((width,), actions, config.members, stream(config.seed, "dataset"), config.bootstrap)
+    scale = (policy.obs_mean, policy.obs_std, policy.action_middle, policy.action_half)
+    critics = {
+        name: Critic(width, actions, "bad" if name == "risk" else "good", policy, config.critic, scale,
+                     stream(config.seed, f"critic/{name}"), derive(config.seed, f"critic/{name}/initial weights"))
+        for name in sorted(priority.needs & {"risk", "goal"})
+    }  # fmt: skip
+    learner = ImitationLearner(policy, dataset, config.learner, critics, config.seed)
+    return Assembly(config, fleet, actor, policy, learner)
+
+
+def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Assembly:
+    """Everything before timestep 0: demonstrations, behaviour cloning, first critic data, thresholds (appendix C.3)."""
+    c, learner, policy = assembly.config, assembly.learner, assembly.policy
+    report("recording demonstrations", 0.0)
+    obs, actions = demonstrations(c, assembly.actor, assembly.fleet.horizon)
+    policy.set_normalisation(obs)
+    learner.dataset.add(obs, actions)
+    _in_steps(c.learner.pretrain, learner.gradient_steps, "behaviour cloning", report)
+
+    if parse(c.priority).needs:
+        signals = _calibrate(assembly, report)
+        for name, critic in learner.critics.items():
+            _in_steps(
+                c.critic.pretrain, lambda n, critic=critic: [critic.update() for _ in range(n)], f"{name} critic", report
+            )
+            signals[name] = np.concatenate([critic(o, a) for o, a in signals["visited"]])
+        assembly = dataclasses.replace(assembly, config=_resolve_thresholds(c, signals))
+    return assembly
+
+
+def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Array, Array]:
+    """Offline data of the human: obs (n, D) float32, actions (n, A). Whole episodes, one a robot; falls are left out."""
+    episodes = max(1, round(config.offline_pairs / horizon))
+    length = min(horizon, -(-config.offline_pairs // episodes))
+    spare = episodes + 2 + episodes // 4  # the human repeats a demonstration that failed
+    fleet = make_fleet(config.task, spare, disturbance=config.offline_disturbance, threads=config.threads)
+    obs, _ = fleet.reset(seed=derive(config.seed, "demonstrations") % 2**32)
+    seen, done = [], []
+    for _ in range(length):
+        action = actor.act(obs)
+        seen.append(obs.astype(np.float32))
+        done.append(action)
+        obs, _, _, _, info = fleet.step(action)
+    fleet.close()
+    (good,) = np.nonzero(~info["violation"])
+    if len(good) < episodes:
+        raise ConfigError(f"the expert fell in {spare - len(good)} of {spare} demonstrations; choose a calmer level")
+    keep = good[:episodes]
+    pairs = [np.stack(rows, axis=1)[keep].reshape(episodes * length, -1) for rows in (seen, done)]
+    return pairs[0][: config.offline_pairs], pairs[1][: config.offline_pairs]
+
+
+def _calibrate(assembly: Assembly, report: Report) -> dict[str, Any]:
+    """Run the cloned policy alone; a robot that falls starts again at once. Feeds the critics, returns what it felt."""
+    c, policy = assembly.config, assembly.policy
+    fleet = assembly.fleet
+    obs, _ = fleet.reset(seed=derive(c.seed, "calibration") % 2**32)
+    uncertainty, visited = [], []
+    for t in range(c.calibration_steps):
+        actions = policy.act(obs)
+        uncertainty.append(policy.uncertainty(obs))
+        visited.append((obs, actions))
+        after, _, violation, truncated, info = fleet.step(actions)
+        for name, critic in assembly.learner.critics.items():
+            event = violation if name == "risk" else info["success"]
+            critic.add(obs, actions, after, event, end=violation)
+        obs = after
+        if (violation | truncated).any():
+            obs, _ = fleet.reset(options={"reset_mask": violation | truncated})
+        report("the cloned policy alone", (t + 1) / c.calibration_steps)
+    return {"uncertainty": np.concatenate(uncertainty), "visited": visited}
+
+
+def _resolve_thresholds(config: RunConfig, signals: dict[str, Any]) -> RunConfig:
+    """Quantiles of the policy's own first steps become the thresholds that were not given as numbers."""
+    t = config.thresholds
+    found = {
+        name: float(np.quantile(signals[name], getattr(t, f"{name}_quantile")))
+        for name in ("uncertainty", "risk")
+        if getattr(t, name) is None and name in signals
+    }
+    return dataclasses.replace(config, thresholds=dataclasses.replace(t, **found))
+
+
+def _resolve_defaults(config: RunConfig) -> RunConfig:
+    """Fill in what the task and the priority decide."""
+    changes: dict[str, Any] = {}
+    t = config.thresholds
+    if config.disturbance is None and config.task in TASKS:
+        changes["disturbance"] = TASKS[config.task].disturbance
+    if t.initial is None:
+        initial = INITIAL_PERIOD.get(config.task, 0) if config.priority.strip(".") == "C.U.R" else 0
+        changes["thresholds"] = dataclasses.replace(t, initial=initial)
+    if set(config.priority.split(".")) <= {"C", ""}:
+        # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).
+        changes["learner"] = dataclasses.replace(config.learner, schedule="never")
+    return dataclasses.replace(config, **changes)
+
+
+def _expert(config: RunConfig) -> Policy:
+    """The policy of the algorithmic humans."""
+    if config.expert and ":" in config.expert and not Path(config.expert).exists():
+        policy = load_object(config.expert, "expert")()
+        if not isinstance(policy, Policy):
+            raise ContractError(f"expert {config.expert!r} must return a policy with act(obs), got {type(policy).__name__}")
+        return policy
+    return experts.load(config.task, Path(config.expert) if config.expert else None)[0]
+
+
+def _in_steps(total: int, work: Callable[[int], Any], name: str, report: Report, chunk: int = 50) -> None:
+    for done in range(0, total, chunk):
+        report(name, done / total)
+        work(min(chunk, total - done))

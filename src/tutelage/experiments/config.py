@@ -1,0 +1,149 @@
+"""One configuration of the loop, as plain data: the flags of `tutelage run`, and `config.json` of its folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from tyro.conf import Positional
+
+from tutelage.errors import ConfigError, RunFolderError
+from tutelage.fleet.priority import PriorityConfig
+from tutelage.learning.critic import CriticConfig
+from tutelage.learning.imitation import LearnerConfig
+
+FORMAT = 1
+"""Version of a run folder. A folder of another version is refused, never guessed at."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """An interactive fleet learning run (chapter 5). The defaults are the dissertation's.
+
+    Attributes:
+        task: name of a task (see `tutelage info tasks`), or "module:function" that makes a fleet.
+        priority: p-hat, such as C.U.R., U.C., U.G.C., C., Random.
+        robots: N.
+        humans: M.
+        steps: T, timesteps of the run.
+        seed: root seed of every random stream.
+        t_teleop: t_T, minimum timesteps of a teleoperation.
+        t_reset: t_R, timesteps of a hard reset.
+        latency: L, timesteps between an assignment and its beginning; the robot waits.
+        disturbance: level of the world's disturbances; default: the task's own.
+        offline_pairs: state-action pairs of the human before the run, in whole episodes of the supervisor.
+        offline_disturbance: level of disturbance while those were recorded (demonstrations are given in calm).
+        calibration_steps: timesteps that the cloned policy runs alone before the run; from them come the thresholds
+            and the first data of the critics (appendix C.3: about 20,000 transitions).
+        thresholds: of the priority function.
+        learner: the update schedule.
+        critic: of the risk and goal critics.
+        members: networks in the ensemble.
+        hidden: widths of their hidden layers.
+        bootstrap: give each member its own bootstrap sample of the data.
+        supervisor_noise: standard deviation of the humans' trembling, as a fraction of half the action range.
+        expert: the algorithmic humans: a file of weights, or module:function that returns a policy; default: the weights
+            shipped with the task.
+        overlap: learn while physics runs (the update at step t then sees the data up to t - 1).
+        threads: physics threads; default: all cores.
+        torch_threads: threads of matrix products; more than 2 is rarely faster.
+        out: run folder; default: runs/TASK-PRIORITY-sSEED.
+        checkpoint_every: timesteps between checkpoints.
+        metrics_every: timesteps between lines of metrics.jsonl.
+        record: which frames to keep in episodes/: those under human control, all, or none.
+        label: name of the algorithm in reports; default: the priority.
+    """
+
+    task: Positional[str]
+    priority: str = "C.U.R."
+    robots: int = 100
+    humans: int = 10
+    steps: int = 10_000
+    seed: int = 0
+    t_teleop: int = 5
+    t_reset: int = 5
+    latency: int = 0
+    disturbance: str | None = None
+    offline_pairs: int = 5000
+    offline_disturbance: str = "none"
+    calibration_steps: int = 200
+    thresholds: PriorityConfig = field(default_factory=PriorityConfig)
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    critic: CriticConfig = field(default_factory=CriticConfig)
+    members: int = 5
+    hidden: tuple[int, ...] = (256, 256)
+    bootstrap: bool = True
+    supervisor_noise: float = 0.0
+    expert: str | None = None
+    overlap: bool = False
+    threads: int | None = None
+    torch_threads: int = 2
+    out: Path | None = None
+    checkpoint_every: int = 1000
+    metrics_every: int = 20
+    record: Literal["human", "all", "none"] = "human"
+    label: str | None = None
+
+    def __post_init__(self) -> None:
+        at_least = {
+            "robots": 1, "humans": 1, "steps": 1, "t_teleop": 1, "t_reset": 1, "latency": 0, "offline_pairs": 1,
+            "calibration_steps": 1, "members": 1, "torch_threads": 1, "checkpoint_every": 1, "metrics_every": 1, "seed": 0,
+        }  # fmt: skip
+        for name, least in at_least.items():
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if self.humans > self.robots:
+            raise ConfigError(f"{self.humans} humans for {self.robots} robots: use at most one human a robot (M <= N)")
+        if not self.supervisor_noise >= 0:
+            raise ConfigError(f"supervisor_noise must be >= 0, got {self.supervisor_noise}")
+        if self.threads is not None and self.threads < 1:
+            raise ConfigError(f"threads must be at least 1, got {self.threads}")
+
+    @property
+    def folder(self) -> Path:
+        """Where the run is kept."""
+        task = self.task.replace(":", ".").replace("/", ".")
+        return self.out or Path("runs") / f"{task}-{self.priority.rstrip('.')}-s{self.seed}"
+
+    @property
+    def algorithm(self) -> str:
+        """Name in reports."""
+        return self.label or self.priority
+
+
+def to_json(config: Any) -> dict[str, Any]:
+    """A configuration as JSON values."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))  # type: ignore[no-any-return]
+
+
+def from_json(cls: Any, values: Mapping[str, Any]) -> Any:
+    """A configuration of dataclass `cls` from JSON values.
+
+    Raises:
+        RunFolderError: a name that this version does not know, or a value of the wrong kind.
+    """
+    hints = get_type_hints(cls)
+    unknown = set(values) - set(hints)
+    if unknown:
+        raise RunFolderError(f"unknown settings {sorted(unknown)}: the folder was written by another version of Tutelage")
+    try:
+        return cls(**{name: _restore(hints[name], value) for name, value in values.items()})
+    except (TypeError, ValueError) as error:
+        raise RunFolderError(f"a setting has the wrong kind: {error}") from None
+
+
+def _restore(kind: Any, value: Any) -> Any:
+    if value is None:
+        return None
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(k for k in get_args(kind) if k is not type(None))
+    if dataclasses.is_dataclass(kind):
+        return from_json(kind, value)
+    if get_origin(kind) is tuple:
+        return tuple(value)
+    return Path(value) if kind is Path else value

@@ -1,0 +1,80 @@
+"""A frozen policy at work: how good is it by itself, or with help (appendix C.3, table C.2)?"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tutelage.experiments.assemble import Assembly, assemble
+from tutelage.experiments.config import RunConfig
+from tutelage.experiments.run import read_config
+from tutelage.fleet.allocation import FleetDAgger
+from tutelage.fleet.loop import Loop
+from tutelage.fleet.metrics import Counting, Tally
+from tutelage.fleet.policy import Policy
+from tutelage.fleet.priority import parse
+from tutelage.fleet.step import Subscriber
+from tutelage.fleet.supervisor import PolicySupervisor, Team
+from tutelage.policies.ensemble import EnsemblePolicy
+from tutelage.store import write_atomic
+
+
+def evaluate_policy(
+    config: RunConfig,
+    policy: Policy | None,
+    priority: str = "C.",
+    tally: Tally | None = None,
+    subscribers: Sequence[Subscriber] = (),
+) -> dict[str, float]:
+    """Run a frozen policy for `config.steps` timesteps; returns the metrics.
+
+    Args:
+        config: task, N, M, T, seed and disturbance are taken from it. The random streams are those of the seed's
+            evaluation, which training never uses.
+        policy: the policy; None: the algorithmic expert itself.
+        priority: who gets help; "C." gives hard resets and nothing else. Terms that look at the policy's signals
+            need a policy that has them.
+        tally: where to count, for a display that watches it.
+        subscribers: listeners, such as a progress display.
+    """
+    assembly: Assembly = assemble(dataclasses.replace(config, priority=priority))
+    tally = tally or Tally(config.robots, config.humans)
+    loop = Loop(
+        assembly.fleet,
+        assembly.actor if policy is None else policy,
+        parse(priority, assembly.config.thresholds),
+        Team([PolicySupervisor(assembly.actor)] * config.humans, config.latency),
+        FleetDAgger(config.t_teleop, config.t_reset),
+        subscribers=[Counting(tally), *subscribers],
+        seed=config.seed + 1_000_000,
+    )
+    loop.run(config.steps)
+    assembly.fleet.close()
+    return tally.summary()
+
+
+def evaluate_run(
+    folder: Path,
+    steps: int,
+    priority: str = "C.",
+    expert: bool = False,
+    tally: Tally | None = None,
+    subscribers: Sequence[Subscriber] = (),
+) -> dict[str, Any]:
+    """Evaluate the policy of a run folder as in table C.2, and write `evaluation.json` there.
+
+    Raises:
+        RunFolderError, TutelageError: no run there, or no policy in it.
+    """
+    config = dataclasses.replace(read_config(folder), steps=steps)
+    policy = None if expert else EnsemblePolicy.load(folder / "policy.safetensors")[0]
+    metrics = evaluate_policy(config, policy, priority, tally, subscribers)
+    result = {"steps": steps, "priority": priority, "policy": "expert" if expert else "run", **metrics}
+    name = "evaluation-expert.json" if expert else "evaluation.json"
+    write_atomic(folder / name, json.dumps(result, indent=2).encode())
+    return result
+
+

@@ -1,0 +1,46 @@
+"""Plots that follow a run: `plots/curves.png` is drawn anew while it goes on, and at its end."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from tutelage.errors import MissingExtraError
+from tutelage.fleet.loop import Loop
+from tutelage.fleet.step import Step
+
+
+class LivePlots:
+    """Redraws the curves of a run about once in `seconds`; without matplotlib there are none.
+
+    Args:
+        folder: the run folder.
+        seconds: between two drawings.
+    """
+
+    def __init__(self, folder: Path, seconds: float = 20.0) -> None:
+        self._folder, self._seconds = folder, seconds
+        self._last = time.monotonic()
+
+    def on_start(self, loop: Loop) -> None:
+        """Nothing to do."""
+
+    def on_step(self, loop: Loop, step: Step) -> None:
+        """Draw when the last drawing is old."""
+        if time.monotonic() - self._last > self._seconds:
+            self.draw()
+            self._last = time.monotonic()
+
+    def on_end(self, loop: Loop) -> None:
+        """Draw the end."""
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw the curves so far."""
+        from tutelage.experiments import plots
+        from tutelage.experiments.report import load_run
+
+        try:
+            plots.save(plots.curves([load_run(self._folder)]), self._folder / "plots" / "curves.png")
+        except MissingExtraError:
+            self._seconds = float("inf")

@@ -1,0 +1,146 @@
+"""Runs that survive: a folder that holds everything, written as the run goes, from which it can be continued."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import tutelage
+from tutelage.errors import RunFolderError
+from tutelage.experiments.assemble import Assembly, assemble, prepare
+from tutelage.experiments.config import FORMAT, RunConfig, from_json, to_json
+from tutelage.experiments.recording import Recorder, lock
+from tutelage.fleet.loop import Loop
+from tutelage.fleet.step import Step, Subscriber
+from tutelage.store import load_tree, save_tree, write_atomic
+
+
+class Checkpoints:
+    """Saves everything needed to continue bit for bit, every so many timesteps: data first, then the checkpoint.
+
+    A crash between the two leaves data beyond the checkpoint, which resuming cuts off.
+    """
+
+    def __init__(self, folder: Path, recorder: Recorder, assembly: Assembly) -> None:
+        self.path = folder / "checkpoint" / "state.safetensors"
+        self._folder, self._recorder, self._assembly = folder, recorder, assembly
+        self._complete = -1
+
+    def on_start(self, loop: Loop) -> None:
+        """Nothing to do: a run that starts or resumes has its checkpoint."""
+        self._complete = loop.t
+
+    def on_step(self, loop: Loop, step: Step) -> None:
+        """Save when due. This subscriber is the last one: when it hears of a step, everybody has written it down."""
+        self._complete = loop.t
+        if loop.t % self._assembly.config.checkpoint_every == 0:
+            self.save(loop)
+
+    def on_end(self, loop: Loop) -> None:
+        """Save where the run ended, unless it broke in the middle of a step: then the last checkpoint is the truth."""
+        if not loop.in_step and self._complete == loop.t:
+            self.save(loop)
+
+    def save(self, loop: Loop) -> None:
+        """Make recordings durable, then replace the checkpoint and the policy."""
+        self._recorder.commit(loop.t)
+        save_tree(self.path, {"format": FORMAT, "loop": loop.state_dict(), "recorder": self._recorder.state_dict()})
+        card = {"task": self._assembly.config.task, "t": loop.t, "algorithm": self._assembly.config.algorithm}
+        self._assembly.policy.save(self._folder / "policy.safetensors", card)
+
+    def load(self, loop: Loop) -> None:
+        """Continue from the checkpoint: restore the state, cut the recordings back to it."""
+        state = load_tree(self.path)
+        if state.get("format") != FORMAT:
+            raise RunFolderError(f"{self.path} has format {state.get('format')}, this version reads {FORMAT}")
+        loop.load_state_dict(state["loop"])
+        self._recorder.load_state_dict(state["recorder"])
+        self._recorder.cut(loop.t)
+
+
+class Run:
+    """A run in its folder: `Run.start(config)` makes a new one, `Run.resume(folder)` continues one; then `.run()`."""
+
+    def __init__(self, folder: Path, assembly: Assembly) -> None:
+        self.folder, self.assembly, self.config = folder, assembly, assembly.config
+        self._lock = lock(folder)
+        c = self.config
+        self.recorder = Recorder(folder, c.robots, c.humans, c.steps, c.metrics_every, c.record)
+        self.loop = assembly.loop()
+        self.checkpoints = Checkpoints(folder, self.recorder, assembly)
+
+    @classmethod
+    def start(cls, config: RunConfig, report: Any = lambda what, done: None) -> Run:
+        """Prepare a new run.
+
+        Raises:
+            RunFolderError: the folder already holds a run.
+            ConfigError: see `assemble`.
+        """
+        folder = config.folder
+        if (folder / "config.json").exists():
+            raise RunFolderError(f"{folder} already holds a run; continue it with: tutelage resume {folder}, or choose --out")
+        assembly = prepare(assemble(config), report)
+        folder.mkdir(parents=True, exist_ok=True)
+        run = cls(folder, assembly)
+        run.checkpoints.save(run.loop)
+        write_atomic(folder / "environment.txt", environment().encode())
+        # Written last: a folder with a configuration is one that can be continued.
+        content = {"format": FORMAT, "version": tutelage.__version__, "algorithm": config.algorithm, **to_json(assembly.config)}
+        write_atomic(folder / "config.json", json.dumps(content, indent=2).encode())
+        return run
+
+    @classmethod
+    def resume(cls, folder: Path) -> Run:
+        """Continue a run from its last checkpoint, as if it had never stopped.
+
+        Raises:
+            RunFolderError: no run there, of another version, or in use.
+        """
+        config = dataclasses.replace(read_config(folder), out=folder)
+        run = cls(folder, assemble(config))
+        run.checkpoints.load(run.loop)
+        return run
+
+    def run(self, subscribers: Sequence[Subscriber] = ()) -> dict[str, float]:
+        """Run to the end; returns the final metrics. An interruption leaves a folder that can be continued."""
+        self.loop.subscribers = [self.recorder, *subscribers, self.checkpoints]
+        self.loop.run(self.config.steps)
+        return self.recorder.tally.summary()
+
+
+def read_config(folder: Path) -> RunConfig:
+    """The resolved configuration of a run.
+
+    Raises:
+        RunFolderError: no run there, or one of another version.
+    """
+    path = folder / "config.json"
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        found = values.pop("format")
+    except FileNotFoundError:
+        raise RunFolderError(f"{folder} holds no run (no config.json); start one with: tutelage run") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, AttributeError):
+        raise RunFolderError(f"{path} is damaged") from None
+    if found != FORMAT:
+        raise RunFolderError(f"{folder} has format {found}, this version reads {FORMAT}; use the version that wrote it")
+    values.pop("version", None)
+    values.pop("algorithm", None)
+    return from_json(RunConfig, values)  # type: ignore[no-any-return]
+
+
+def environment() -> str:
+    """What the run was made with: Python, machine, versions of the packages that matter."""
+    lines = [f"python {platform.python_version()}", f"machine {platform.platform()}", f"processor {platform.machine()}"]
+    for package in ("tutelage", "numpy", "torch", "gymnasium", "mujoco", "numba", "safetensors"):
+        try:
+            lines.append(f"{package} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            lines.append(f"{package} not installed")
+    return "\n".join(lines) + "\n"
