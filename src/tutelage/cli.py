@@ -154,7 +154,9 @@ def info(what: Positional[Literal["tasks", "levels", "priorities", "version"]] =
         from tutelage.fleet.priority import TERMS, UncertaintyGoal
 
         terms = {**TERMS, "U.G": UncertaintyGoal}
-        _print_table(["term", "meaning"], [[n, (t.__doc__ or "").split(": ", 1)[-1].splitlines()[0]] for n, t in terms.items()])
+        _print_table(
+            ["term", "meaning"], [[n, (t.__doc__ or "").split(": ", 1)[-1].splitlines()[0]] for n, t in terms.items()]
+        )
     else:
         from tutelage.envs.mujoco_fleet import MujocoFleet
         from tutelage.envs.tasks import TASKS
@@ -194,7 +196,9 @@ def _go(prepared: Run) -> None:
     with _interruptible(prepared.loop):
         metrics = prepared.run([display, LivePlots(prepared.folder)])
     if prepared.loop.t < c.steps:
-        console.print(f"stopped at timestep {prepared.loop.t}; continue with: tutelage resume {prepared.folder}", soft_wrap=True)
+        console.print(
+            f"stopped at timestep {prepared.loop.t}; continue with: tutelage resume {prepared.folder}", soft_wrap=True
+        )
     else:
         _print_metrics(metrics)
     console.print(f"run folder: {prepared.folder}   plots: {prepared.folder / 'plots'}", highlight=False, soft_wrap=True)
@@ -229,8 +233,6 @@ def _print_table(head: list[str], rows: list[list[str]]) -> None:
     for row in rows:
         table.add_row(*row)
     console.print(table, highlight=False)
-
-
 
 
 def main(args: Sequence[str] | None = None) -> None:

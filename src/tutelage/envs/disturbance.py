@@ -46,6 +46,7 @@ class Disturbance:
 LEVELS: dict[str, Disturbance] = {
     "none": Disturbance(),
     "mild": Disturbance(noise=0.1, push=0.1, mass=0.02, friction=0.1),
+    "light": Disturbance(noise=0.15, push=0.15, mass=0.03, friction=0.15),
     "moderate": Disturbance(noise=0.2, push=0.2, mass=0.04, friction=0.2),
     "strong": Disturbance(noise=0.3, push=0.3, mass=0.06, friction=0.3),
     "severe": Disturbance(noise=0.4, push=0.4, mass=0.08, friction=0.4),

@@ -76,5 +76,3 @@ def evaluate_run(
     name = "evaluation-expert.json" if expert else "evaluation.json"
     write_atomic(folder / name, json.dumps(result, indent=2).encode())
     return result
-
-

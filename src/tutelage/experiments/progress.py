@@ -52,7 +52,9 @@ class ProgressDisplay:
                 self._bar.update(self._task, completed=loop.t, metrics=self._metrics(loop))
         elif loop.t % max(1, self._steps // 10) == 0:
             rate = (loop.t - self._first) / max(1e-9, time.monotonic() - self._began)
-            self._console.print(f"{self._name}  {loop.t}/{self._steps}  {rate:.0f} steps/s  {self._metrics(loop)}", highlight=False)
+            self._console.print(
+                f"{self._name}  {loop.t}/{self._steps}  {rate:.0f} steps/s  {self._metrics(loop)}", highlight=False
+            )
 
     def on_end(self, loop: Loop) -> None:
         """Take the bar down."""

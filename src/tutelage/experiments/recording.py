@@ -210,8 +210,10 @@ class Recorder:
         return {**self.tally.summary(), **{f"loss/{name}": loss for name, loss in self.losses.items()}}
 
     def on_end(self, loop: Loop) -> None:
-        """Make it durable."""
-        self.commit(loop.t)
+        """Nothing to do: the run closes its recorder after everybody has heard of the end."""
+
+    def close(self) -> None:
+        """Make everything durable and close the files."""
         self.events.close()
         self.metrics.close()
 

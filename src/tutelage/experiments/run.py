@@ -84,14 +84,21 @@ class Run:
         """
         folder = config.folder
         if (folder / "config.json").exists():
-            raise RunFolderError(f"{folder} already holds a run; continue it with: tutelage resume {folder}, or choose --out")
+            raise RunFolderError(
+                f"{folder} already holds a run; continue it with: tutelage resume {folder}, or choose --out"
+            )
         assembly = prepare(assemble(config), report)
         folder.mkdir(parents=True, exist_ok=True)
         run = cls(folder, assembly)
         run.checkpoints.save(run.loop)
         write_atomic(folder / "environment.txt", environment().encode())
         # Written last: a folder with a configuration is one that can be continued.
-        content = {"format": FORMAT, "version": tutelage.__version__, "algorithm": config.algorithm, **to_json(assembly.config)}
+        content = {
+            "format": FORMAT,
+            "version": tutelage.__version__,
+            "algorithm": config.algorithm,
+            **to_json(assembly.config),
+        }
         write_atomic(folder / "config.json", json.dumps(content, indent=2).encode())
         return run
 
@@ -110,7 +117,10 @@ class Run:
     def run(self, subscribers: Sequence[Subscriber] = ()) -> dict[str, float]:
         """Run to the end; returns the final metrics. An interruption leaves a folder that can be continued."""
         self.loop.subscribers = [self.recorder, *subscribers, self.checkpoints]
-        self.loop.run(self.config.steps)
+        try:
+            self.loop.run(self.config.steps)
+        finally:
+            self.recorder.close()
         return self.recorder.tally.summary()
 
 

@@ -106,11 +106,11 @@ def finish(config: ExpertConfig, level: str, best_path: Path, say: Callable[[str
     path = best_path.with_name(f"{config.task}.safetensors")
     actor.save(path, card)
     for s in scores.values():
-        say(f"{config.task} at {s['level']}: {s['mean']:.0f} +- {s['sd']:.0f}, survived {s['survived']:.0%}, {s['episodes']} episodes")
+        say(
+            f"{config.task} at {s['level']}: {s['mean']:.0f} +- {s['sd']:.0f}, survived {s['survived']:.0%}, {s['episodes']} episodes"
+        )
     published = experts.PUBLISHED.get(config.task)
     if published and not experts.is_expert(card):
         say(f"short of the published expert ({published:.0f}): train longer before you call it one")
     say(f"weights: {path}")
     return path
-
-

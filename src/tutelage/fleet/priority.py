@@ -61,7 +61,7 @@ class PriorityConfig:
     uncertainty: float | None = None
     risk: float | None = None
     uncertainty_quantile: float = 0.9
-    risk_quantile: float = 0.9
+    risk_quantile: float = 0.99
     initial: int | None = None
     combined: float = 3.25
     goal_weight: float = 0.25

@@ -43,7 +43,7 @@ class CriticConfig:
         every: timesteps between gradient steps during the run.
     """
 
-    gamma: float = 0.95
+    gamma: float = 0.8
     tau: float = 0.005
     learning_rate: float = 3e-4
     batch: int = 256

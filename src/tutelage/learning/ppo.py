@@ -36,10 +36,13 @@ class PPOConfig:
         gamma: discount.
         lam: lambda of generalised advantage estimation.
         clip: clipping range of the probability ratio.
-        target_kl: the learning rate is adapted to keep the KL divergence of an update near this; an update stops at twice as much.
+        target_kl: the learning rate is adapted to keep the KL divergence of an update near this; an update
+            stops at twice as much.
         learning_rate: initial learning rate of Adam.
         max_grad_norm: gradients are scaled down to this norm.
         entropy: weight of the entropy bonus.
+        fall_penalty: subtracted from the reward of a step that ends in violation, for a safer gait; scores never
+            include it.
         hidden: widths of the hidden layers of actor and critic.
     """
 
@@ -53,6 +56,7 @@ class PPOConfig:
     learning_rate: float = 3e-4
     max_grad_norm: float = 1.0
     entropy: float = 0.0
+    fall_penalty: float = 0.0
     hidden: tuple[int, ...] = (256, 128)
 
 
@@ -119,11 +123,12 @@ class PPO:
             u = mean + self.actor.log_std.exp() * noise
             raw.append(self._obs[:, : self.features].copy())
             obs, reward, terminated, truncated, _ = self.fleet.step(self.actor.to_action(u))
+            self._returns += reward
+            reward = reward - c.fall_penalty * terminated
             after = self.actor.normalise(obs)
             done = terminated | truncated
             self._discounted = self._discounted * c.gamma + reward
             self.return_moments.update(self._discounted[:, None])
-            self._returns += reward
             self._discounted[done] = 0.0
             if done.any():
                 self.finished += list(zip(self._returns[done].tolist(), truncated[done].astype(float).tolist(), strict=True))

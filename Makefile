@@ -1,0 +1,53 @@
+# Two commands: `make demo` shows the main job, `make test` runs all tests. Both set up the same virtual environment.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+SYSTEM := $(VENV)/.system
+DEMO := runs/demo
+
+.PHONY: demo test lint docs examples bench clean help
+
+help: ## this list
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+demo: $(INSTALLED) ## 100 robots, 10 humans: C.U.R. against behaviour cloning, same seed
+	rm -rf $(DEMO)
+	$(BIN)/tutelage run Walker2d --priority C. --label "Behaviour cloning" --steps 3000 --out $(DEMO)/behaviour-cloning
+	$(BIN)/tutelage run Walker2d --priority C.U.R. --steps 3000 --overlap --out $(DEMO)/cur
+	$(BIN)/tutelage report $(DEMO)/behaviour-cloning $(DEMO)/cur
+
+test: $(INSTALLED) $(SYSTEM) ## all tests
+	$(BIN)/pytest -n auto --dist loadfile
+
+lint: $(INSTALLED) ## ruff, mypy, import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+examples: $(INSTALLED) ## the code of the README and the examples
+	$(BIN)/python tests/run_examples.py
+
+docs: $(INSTALLED) ## the documentation as a web site, in site/
+	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+	$(BIN)/mkdocs build --strict
+
+bench: $(INSTALLED) ## the speed claims, as ratios on this machine
+	$(BIN)/python -m benchmarks
+
+clean: ## remove the environment and the demo's runs
+	rm -rf $(VENV) $(DEMO) site
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+# Rendering tests need an OpenGL library without a screen. Installed where that is allowed (root and apt); elsewhere the
+# tests that need it skip and say so.
+$(SYSTEM): $(INSTALLED)
+	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! $(BIN)/python -c "import ctypes; ctypes.CDLL('libEGL.so.1')" 2>/dev/null; then \
+	  apt-get update -qq && apt-get install -qq -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libosmesa6 >/dev/null; fi
+	touch $@

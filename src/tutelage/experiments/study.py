@@ -1,0 +1,205 @@
+"""The comparison of section 5.6 and appendix C: all algorithms and seeds, in parallel, resumable.
+
+    python -m tutelage.experiments.study Walker2d --seeds 0 1 2 3 4
+    python -m tutelage.experiments.study Walker2d --ablations --seeds 0 1 2 --evaluate 0
+
+C.U.R. runs first. Its mean human time T_h sets the others: the Constraint baseline gets T_h more offline pairs and as many
+gradient steps in all, Random a threshold at which it solicits T_h in expectation. Every policy is then evaluated frozen,
+with hard resets only, and so is the expert (table C.2). Small result files go to results/.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import traceback
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tyro.conf import Positional
+
+from tutelage.experiments.config import RunConfig, to_json
+from tutelage.fleet.allocation import NOBODY, FleetDAgger
+from tutelage.fleet.modes import Mode
+from tutelage.fleet.priority import PriorityConfig
+from tutelage.learning.imitation import LearnerConfig
+from tutelage.seeding import stream
+from tutelage.store import write_atomic
+
+BEHAVIOUR_CLONING = "C. (BC)"
+ABLATIONS = ("C.U.R.(-i)", "C.U.", "C.R.", "U.R.", "U.", "R.")
+"""The subsets of figure C.1, none with an initial period."""
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """A comparison of allocation algorithms on one task.
+
+    Attributes:
+        task: name of a task.
+        seeds: root seeds; never those used for tuning (100 and above).
+        steps: T.
+        robots: N.
+        humans: M.
+        evaluate: timesteps of the evaluation of the frozen policies; 0: none.
+        ablations: run C.U.R. and its ablations (figure C.1) instead of the baselines.
+        workers: runs side by side, one core each.
+        out: folder of the run folders.
+        results: folder of the small result files.
+    """
+
+    task: Positional[str]
+    seeds: tuple[int, ...] = (0, 1, 2)
+    steps: int = 10_000
+    robots: int = 100
+    humans: int = 10
+    evaluate: int = 10_000
+    ablations: bool = False
+    workers: int = 4
+    out: Path = Path("runs/study")
+    results: Path = Path("results/fleet")
+
+
+def random_threshold(budget: float, steps: int, robots: int, humans: int, t_teleop: int, t_reset: int) -> float:
+    """The threshold at which Random solicits `budget` human timesteps in expectation, over `steps`.
+
+    Found by bisection on simulated allocation alone (no robot falls, so the budget is met by teleoperation).
+    """
+    allocator, horizon = FleetDAgger(t_teleop, t_reset), min(steps, 500)
+
+    def busy(threshold: float) -> float:
+        rng = stream(0, "random threshold")
+        robot_of = np.full(humans, NOBODY)
+        mode, age = np.full(robots, Mode.AUTONOMOUS, dtype=np.int8), np.zeros(robots, dtype=np.int64)
+        total = 0
+        for _ in range(horizon):
+            score = rng.random((robots, 1))
+            after = allocator(np.where(score > threshold, score, 0.0), robot_of, mode, age, rng)
+            age[after[(after != robot_of) & (after != NOBODY)]] = 0
+            robot_of = after
+            mode[:] = Mode.AUTONOMOUS
+            mode[robot_of[robot_of != NOBODY]] = Mode.TELEOPERATED
+            age += 1
+            total += int((robot_of != NOBODY).sum())
+        return total / horizon
+
+    low, high, wanted = 0.0, 1.0, budget / steps
+    for _ in range(20):
+        middle = (low + high) / 2
+        low, high = (middle, high) if busy(middle) > wanted else (low, middle)
+    return (low + high) / 2
+
+
+def configurations(study: StudyConfig, human_time: float | None) -> dict[str, RunConfig]:
+    """The first seed's configuration of each algorithm; human_time: T_h of C.U.R., None while it is not known."""
+    base = RunConfig(
+        study.task, steps=study.steps, robots=study.robots, humans=study.humans, threads=1, torch_threads=1,
+        record="none", label="C.U.R.",
+    )  # fmt: skip
+    if human_time is None:
+        return {"C.U.R.": base}
+    with_ = dataclasses.replace
+    if study.ablations:
+        return {
+            name: with_(
+                base, priority=name.replace("(-i)", ""), label=name, thresholds=PriorityConfig(initial=0)
+            )
+            for name in ABLATIONS
+        }  # fmt: skip
+    threshold = random_threshold(human_time, study.steps, study.robots, study.humans, base.t_teleop, base.t_reset)
+    cloning = LearnerConfig(schedule="never", pretrain=base.learner.pretrain + study.steps)
+    return {
+        BEHAVIOUR_CLONING: with_(
+            base,
+            priority="C.",
+            label=BEHAVIOUR_CLONING,
+            learner=cloning,
+            offline_pairs=base.offline_pairs + round(human_time),
+        ),
+        "Random": with_(base, priority="Random.", label="Random", thresholds=PriorityConfig(random=threshold)),
+        "U.C.": with_(base, priority="U.C.", label="U.C."),
+    }
+
+
+def one(config: RunConfig, evaluate: int, expert: bool) -> dict[str, Any]:
+    """Run or continue one configuration, evaluate it, and return the small result. Runs in a process of its own."""
+    from tutelage.experiments.evaluate import evaluate_run
+    from tutelage.experiments.report import load_run
+    from tutelage.experiments.run import Run
+
+    folder = config.folder
+    run = Run.resume(folder) if (folder / "config.json").exists() else Run.start(config)
+    metrics = run.run()
+    resolved = to_json(run.config)
+    result: dict[str, Any] = {"algorithm": config.algorithm, "seed": config.seed, "metrics": metrics}
+    if evaluate:
+        path = folder / "evaluation.json"
+        result["evaluation"] = json.loads(path.read_text()) if path.exists() else evaluate_run(folder, evaluate)
+    if evaluate and expert:
+        path = folder / "evaluation-expert.json"
+        result["expert"] = json.loads(path.read_text()) if path.exists() else evaluate_run(folder, evaluate, expert=True)
+    record = load_run(folder)
+    lines = record.metrics
+    pick = np.unique(np.linspace(0, len(lines["t"]) - 1, 50).round().astype(int))
+    names = ("t", "successes", "hard_resets", "idle_time", "human_time", "rohe")
+    result["curves"] = {name: [round(float(v), 4) for v in lines[name][pick]] for name in names}
+    for name in ("out", "threads", "torch_threads", "record"):
+        resolved.pop(name)
+    result["config"] = resolved
+    return result
+
+
+def run_study(study: StudyConfig) -> list[dict[str, Any]]:
+    """Run what is missing; returns the small results of all runs, also written one file each."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(study.workers, mp_context=context) as pool:
+        reference = _run_all(pool, study, configurations(study, None))
+        human_time = float(np.mean([r["metrics"]["human_time"] for r in reference]))
+        print(f"C.U.R. solicited {human_time:,.0f} human timesteps on average", flush=True)
+        return reference + _run_all(pool, study, configurations(study, human_time))
+
+
+def _run_all(pool: ProcessPoolExecutor, study: StudyConfig, configs: dict[str, RunConfig]) -> list[dict[str, Any]]:
+    jobs = {}
+    kind = "ablations" if study.ablations else "comparison"
+    for seed in study.seeds:
+        for name, config in configs.items():
+            slug = "".join(ch for ch in name.lower().replace("(-i)", "-no-initial") if ch.isalnum() or ch == "-")
+            # C.U.R. is the same run in the comparison and among the ablations of equal length.
+            place = study.out / f"{study.task}-{study.robots}x{study.humans}-{study.steps}"
+            config = dataclasses.replace(config, seed=seed, out=place / f"{slug}-s{seed}")
+            file = study.results / kind / study.task / f"{slug}-s{seed}.json"
+            expert = name == "C.U.R." and not study.ablations
+            jobs[pool.submit(one, config, study.evaluate, expert)] = (f"{study.task} {name} seed {seed}", file)
+    results = []
+    for job in as_completed(jobs):
+        title, file = jobs[job]
+        try:
+            result = job.result()
+        except Exception:
+            print(f"{title} FAILED\n{traceback.format_exc()}", flush=True)
+            continue
+        write_atomic(file, (json.dumps(result, indent=1) + "\n").encode())
+        m, e = result["metrics"], result.get("evaluation", {})
+        print(
+            f"{title}: successes {m['successes']:.0f}, hard resets {m['hard_resets']:.0f}, human time {m['human_time']:.0f}, "
+            f"ROHE {m['rohe']:.3f}; frozen: successes {e.get('successes', float('nan')):.0f}",
+            flush=True,
+        )
+        results.append(result)
+    return results
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of `python -m tutelage.experiments.study`."""
+    run_study(tyro.cli(StudyConfig, args=args, description=__doc__))
+
+
+if __name__ == "__main__":
+    main()
