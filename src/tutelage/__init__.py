@@ -1,3 +1,3 @@
-"""Supervised autonomy for robot fleets: a few people keep many robots working, and every intervention makes the fleet better."""
+"""Supervised autonomy for robot fleets: a few people keep many robots working, every intervention makes the fleet better."""
 
 __version__ = "0.1.0"

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from tutelage.experiments.run import Run
     from tutelage.fleet.loop import Loop
 
-console = Console()
+console = Console(markup=False, width=None if sys.stdout.isatty() else 200)
+"""Without markup, as names of folders may contain brackets; wide where there is no terminal, so that lines stay lines."""
 
 
 def run(config: Annotated[RunConfig, arg(name="")]) -> None:
@@ -130,7 +131,7 @@ def check(
     else:
         checks.check_supervisor(load_object(name, kind)(), fleet)
     fleet.close()
-    console.print(f"{name} keeps the contract of a {kind}", highlight=False)
+    console.print(f"{name} keeps the contract of {'an' if kind == 'env' else 'a'} {kind}", highlight=False)
 
 
 def info(what: Positional[Literal["tasks", "levels", "priorities", "version"]] = "tasks") -> None:
@@ -221,9 +222,12 @@ def _interruptible(loop: Loop) -> Iterator[None]:
 
 
 def _print_metrics(metrics: dict[str, Any]) -> None:
-    rows = [[name, f"{value:,.2f}" if isinstance(value, float) and value % 1 else f"{value:,}" if not isinstance(value, str) else value]
-            for name, value in metrics.items()]  # fmt: skip
-    _print_table(["metric", "value"], rows)
+    def text(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:,.2f}" if value % 1 else f"{value:,.0f}"
+        return f"{value:,}" if isinstance(value, int) else str(value)
+
+    _print_table(["metric", "value"], [[name, text(value)] for name, value in metrics.items()])
 
 
 def _print_table(head: list[str], rows: list[list[str]]) -> None:
@@ -257,3 +261,6 @@ def main(args: Sequence[str] | None = None) -> None:
     except TutelageError as error:
         print(f"tutelage: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("tutelage: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None

@@ -13,8 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from tutelage.envs import experts
+from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import find_task, load_object, make_fleet
 from tutelage.envs.tasks import TASKS
+from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError, ContractError
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.allocation import FleetDAgger
@@ -23,10 +25,12 @@ from tutelage.fleet.loop import Loop
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import parse
 from tutelage.fleet.supervisor import NoisySupervisor, PolicySupervisor, Supervisor, Team
+from tutelage.fleet.view import Signal
 from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.imitation import ImitationLearner
 from tutelage.policies.ensemble import EnsemblePolicy
+from tutelage.policies.expert import GaussianActor
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
@@ -65,7 +69,7 @@ class Assembly:
             Team([supervisor] * c.humans, c.latency),
             FleetDAgger(c.t_teleop, c.t_reset),
             self.learner,
-            {name: lambda view, critic=critic: critic(view.obs, view.actions) for name, critic in critics.items()},
+            {name: _estimate(critic) for name, critic in critics.items()},
             overlap=c.overlap,
             seed=c.seed,
         )
@@ -82,14 +86,17 @@ def assemble(config: RunConfig) -> Assembly:
     config = _resolve_defaults(config)
     priority = parse(config.priority, config.thresholds)
     actor = _expert(config)
-    options: dict[str, Any] = {"disturbance": config.disturbance}
-    if config.task in TASKS:
-        assert config.disturbance is not None
-        options["success_return"] = experts.success_return(config.task, config.disturbance, threads=config.threads)
-    fleet = make_fleet(config.task, config.robots, threads=config.threads, **options)
+    fleet = make_fleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)
 
     width = fleet.single_observation_space.shape[0]  # type: ignore[index]
     actions = len(fleet.action_low)
+    if isinstance(actor, GaussianActor) and (actor.features > width or len(actor.low) != actions):
+        raise ContractError(
+            f"the expert {config.expert} sees {actor.features} numbers and gives {len(actor.low)} actions, "
+            f"but {config.task} shows {width} and takes {actions}; train one with: tutelage train-expert {config.task}"
+        )
+    if config.task in TASKS and isinstance(fleet, MujocoFleet):
+        fleet.success_return = _success_return(config, actor)
     policy = EnsemblePolicy(
         width, fleet.action_low, fleet.action_high,
         members=config.members, hidden=config.hidden, seed=derive(config.seed, "policy/initial weights"),
@@ -117,9 +124,7 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
     if parse(c.priority).needs:
         signals = _calibrate(assembly, report)
         for name, critic in learner.critics.items():
-            _in_steps(
-                c.critic.pretrain, lambda n, critic=critic: [critic.update() for _ in range(n)], f"{name} critic", report
-            )
+            _in_steps(c.critic.pretrain, critic.updates, f"{name} critic", report)
             signals[name] = np.concatenate([critic(o, a) for o, a in signals["visited"]])
         assembly = dataclasses.replace(assembly, config=_resolve_thresholds(c, signals))
     return assembly
@@ -130,7 +135,10 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
     episodes = max(1, round(config.offline_pairs / horizon))
     length = min(horizon, -(-config.offline_pairs // episodes))
     spare = episodes + 2 + episodes // 4  # the human repeats a demonstration that failed
-    fleet = make_fleet(config.task, spare, disturbance=config.offline_disturbance, threads=config.threads)
+    make = find_task(config.task)
+    disturbed = config.disturbance is not None or (isinstance(make, type) and issubclass(make, MujocoTask))
+    level = config.offline_disturbance if disturbed else None  # a fleet of the user's own need not know levels
+    fleet = make_fleet(config.task, spare, disturbance=level, threads=config.threads)
     obs, _ = fleet.reset(seed=derive(config.seed, "demonstrations") % 2**32)
     seen, done = [], []
     for _ in range(length):
@@ -171,7 +179,7 @@ def _calibrate(assembly: Assembly, report: Report) -> dict[str, Any]:
 def _resolve_thresholds(config: RunConfig, signals: dict[str, Any]) -> RunConfig:
     """Quantiles of the policy's own first steps become the thresholds that were not given as numbers."""
     t = config.thresholds
-    found = {
+    found: dict[str, Any] = {
         name: float(np.quantile(signals[name], getattr(t, f"{name}_quantile")))
         for name in ("uncertainty", "risk")
         if getattr(t, name) is None and name in signals
@@ -194,6 +202,11 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
     return dataclasses.replace(config, **changes)
 
 
+def _estimate(critic: Critic) -> Signal:
+    """The critic's estimate for what the policy proposes."""
+    return lambda view: critic(view.obs, view.actions)
+
+
 def _expert(config: RunConfig) -> Policy:
     """The policy of the algorithmic humans."""
     if config.expert and ":" in config.expert and not Path(config.expert).exists():
@@ -202,6 +215,16 @@ def _expert(config: RunConfig) -> Policy:
             raise ContractError(f"expert {config.expert!r} must return a policy with act(obs), got {type(policy).__name__}")
         return policy
     return experts.load(config.task, Path(config.expert) if config.expert else None)[0]
+
+
+def _success_return(config: RunConfig, actor: Policy) -> float:
+    """What makes an episode a success: 95 % of the shipped expert's return, or of this run's where none is shipped."""
+    assert config.disturbance is not None
+    if experts.path_of(config.task).exists():
+        return experts.success_return(config.task, config.disturbance, threads=config.threads)
+    if isinstance(actor, GaussianActor):
+        return experts.success_return(config.task, config.disturbance, Path(config.expert or ""), threads=config.threads)
+    raise ConfigError(f"no expert is shipped with {config.task}, so nothing says what a success is; give its weights")
 
 
 def _in_steps(total: int, work: Callable[[int], Any], name: str, report: Report, chunk: int = 50) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
 from tyro.conf import Positional
 
 from tutelage.errors import ConfigError, RunFolderError
@@ -99,8 +101,12 @@ class RunConfig:
                 raise ConfigError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if self.humans > self.robots:
             raise ConfigError(f"{self.humans} humans for {self.robots} robots: use at most one human a robot (M <= N)")
-        if not self.supervisor_noise >= 0:
-            raise ConfigError(f"supervisor_noise must be >= 0, got {self.supervisor_noise}")
+        if not 0 <= self.supervisor_noise < math.inf:
+            raise ConfigError(f"supervisor_noise must be a number >= 0, got {self.supervisor_noise}")
+        if min(self.hidden, default=1) < 1:
+            raise ConfigError(f"hidden layers must be at least 1 wide, got {self.hidden}")
+        if self.record not in ("human", "all", "none"):
+            raise ConfigError(f"unknown record {self.record!r}: use human, all or none")
         if self.threads is not None and self.threads < 1:
             raise ConfigError(f"threads must be at least 1, got {self.threads}")
 
@@ -118,7 +124,8 @@ class RunConfig:
 
 def to_json(config: Any) -> dict[str, Any]:
     """A configuration as JSON values."""
-    return json.loads(json.dumps(dataclasses.asdict(config), default=str))  # type: ignore[no-any-return]
+    plain = lambda value: value.item() if isinstance(value, np.generic) else str(value)  # noqa: E731
+    return json.loads(json.dumps(dataclasses.asdict(config), default=plain))  # type: ignore[no-any-return]
 
 
 def from_json(cls: Any, values: Mapping[str, Any]) -> Any:
@@ -132,18 +139,24 @@ def from_json(cls: Any, values: Mapping[str, Any]) -> Any:
     if unknown:
         raise RunFolderError(f"unknown settings {sorted(unknown)}: the folder was written by another version of Tutelage")
     try:
-        return cls(**{name: _restore(hints[name], value) for name, value in values.items()})
+        return cls(**{name: _restore(hints[name], value, name) for name, value in values.items()})
     except (TypeError, ValueError) as error:
         raise RunFolderError(f"a setting has the wrong kind: {error}") from None
 
 
-def _restore(kind: Any, value: Any) -> Any:
-    if value is None:
-        return None
+def _restore(kind: Any, value: Any, name: str) -> Any:
     if get_origin(kind) in (Union, UnionType):
+        if value is None:
+            return None
         kind = next(k for k in get_args(kind) if k is not type(None))
-    if dataclasses.is_dataclass(kind):
+    if get_origin(kind) is tuple and isinstance(value, list):
+        return tuple(_restore(get_args(kind)[0], item, name) for item in value)
+    if get_origin(kind) is Literal and value in get_args(kind):
+        return value
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return from_json(kind, value)
-    if get_origin(kind) is tuple:
-        return tuple(value)
-    return Path(value) if kind is Path else value
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if type(value) is kind or (kind is float and type(value) is int):  # not isinstance: True is no number here
+        return value
+    raise TypeError(f"{name} cannot be {value!r}")

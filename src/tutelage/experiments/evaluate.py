@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tutelage.errors import ConfigError
 from tutelage.experiments.assemble import Assembly, assemble
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.run import read_config
@@ -15,7 +16,7 @@ from tutelage.fleet.allocation import FleetDAgger
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.metrics import Counting, Tally
 from tutelage.fleet.policy import Policy
-from tutelage.fleet.priority import parse
+from tutelage.fleet.priority import Uncertainty, parse
 from tutelage.fleet.step import Subscriber
 from tutelage.fleet.supervisor import PolicySupervisor, Team
 from tutelage.policies.ensemble import EnsemblePolicy
@@ -41,11 +42,14 @@ def evaluate_policy(
         subscribers: listeners, such as a progress display.
     """
     assembly: Assembly = assemble(dataclasses.replace(config, priority=priority))
+    terms, thresholds = parse(priority, assembly.config.thresholds), assembly.config.thresholds
+    if thresholds.uncertainty is None and any(isinstance(term, Uncertainty) for term in terms.terms):
+        raise ConfigError(f"this run has no threshold of uncertainty, which {priority} needs; choose C. or Random.")
     tally = tally or Tally(config.robots, config.humans)
     loop = Loop(
         assembly.fleet,
         assembly.actor if policy is None else policy,
-        parse(priority, assembly.config.thresholds),
+        terms,
         Team([PolicySupervisor(assembly.actor)] * config.humans, config.latency),
         FleetDAgger(config.t_teleop, config.t_reset),
         subscribers=[Counting(tally), *subscribers],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from tutelage.errors import MissingExtraError
+from tutelage.errors import MissingExtraError, TutelageError
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.step import Step
 
@@ -36,7 +36,7 @@ class LivePlots:
         self.draw()
 
     def draw(self) -> None:
-        """Draw the curves so far."""
+        """Draw the curves so far, if there are any. A picture that fails must not end a run, nor hide why one ended."""
         from tutelage.experiments import plots
         from tutelage.experiments.report import load_run
 
@@ -44,3 +44,5 @@ class LivePlots:
             plots.save(plots.curves([load_run(self._folder)]), self._folder / "plots" / "curves.png")
         except MissingExtraError:
             self._seconds = float("inf")
+        except TutelageError:  # no line of metrics yet, or a full disk, which the recorder will report
+            pass

@@ -187,13 +187,13 @@ def curves(runs: Sequence[RunRecord], dark: bool = False, titled: bool = True) -
                 _split(axis, runs[0], theme)
             else:
                 for k, group in enumerate(groups.values()):
-                    _line(axis, band(group, panel.metric), **_style(theme, k))
-            _dress(axis, panel, theme, end, _readable(end))
+                    line(axis, band(group, panel.metric), **style(theme, k))
+            dress(axis, panel, theme, end, readable(end))
         entries: list[tuple[str, Any]] = []
         if len(groups) > 1:
             count = "  (n = {})" if len(runs) > len(groups) else ""
             entries = [
-                (label + count.format(len(group)), Line2D([], [], linewidth=2.4, **_style(theme, k)))
+                (label + count.format(len(group)), Line2D([], [], linewidth=2.4, **style(theme, k)))
                 for k, (label, group) in enumerate(groups.items())
             ]
         if len(runs) > len(groups):
@@ -203,7 +203,7 @@ def curves(runs: Sequence[RunRecord], dark: bool = False, titled: bool = True) -
             figure.suptitle(title, x=0.012, ha="left", fontsize=14, fontweight="bold", color=theme.text)
         if entries:
             columns = min(len(entries), 5)
-            names, handles = zip(*_by_column(entries, columns), strict=True)
+            names, handles = zip(*by_column(entries, columns), strict=True)
             figure.legend(
                 handles, names, loc="outside lower left", ncols=columns, frameon=False, fontsize=10,
                 labelcolor=theme.text, handlelength=2.2, columnspacing=2,
@@ -211,18 +211,20 @@ def curves(runs: Sequence[RunRecord], dark: bool = False, titled: bool = True) -
     return figure
 
 
-def _by_column(entries: list[Any], columns: int) -> list[Any]:
+def by_column(entries: list[Any], columns: int) -> list[Any]:
     """Reorder the entries of a legend, which matplotlib fills column by column, so that they read row by row."""
     rows = [entries[k : k + columns] for k in range(0, len(entries), columns)]
     return [row[k] for k in range(columns) for row in rows if k < len(row)]
 
 
-def _style(theme: Theme, k: int) -> dict[str, Any]:
+def style(theme: Theme, k: int) -> dict[str, Any]:
+    """Colour and dashes of the k-th line."""
     rounds = len(theme.series)
     return {"color": theme.series[k % rounds], "linestyle": DASHES[k // rounds % len(DASHES)]}
 
 
-def _line(axis: Axes, curve: tuple[Array, Array, Array], color: str, linestyle: Any) -> None:
+def line(axis: Axes, curve: tuple[Array, Array, Array], color: str, linestyle: Any) -> None:
+    """Draw timesteps, mean and half width of the band, (k,) each."""
     t, mean, half = curve
     if len(t) == 1:
         axis.plot(t, mean, color=color, marker="o", markersize=4, clip_on=False)
@@ -248,7 +250,7 @@ def _split(axis: Axes, run: RunRecord, theme: Theme) -> None:
     )  # fmt: skip
 
 
-def _dress(axis: Axes, panel: Panel, theme: Theme, end: float, label: Callable[..., str]) -> None:
+def dress(axis: Axes, panel: Panel, theme: Theme, end: float, label: Callable[..., str]) -> None:
     """Title, units, grid, limits."""
     axis.set_facecolor(theme.background)
     axis.set_title(panel.title, loc="left", fontsize=11.5, fontweight="bold", color=theme.text, pad=19)
@@ -281,10 +283,10 @@ def _dress(axis: Axes, panel: Panel, theme: Theme, end: float, label: Callable[.
     top = min(axis.dataLim.y1, 1.5 * lines.max()) if len(lines) else axis.dataLim.y1
     axis.set_ylim(0, top * 1.05 if top > 0 else 1)
     axis.locator_params(axis="y", nbins=5, integer=panel.metric not in ("rohe", "loss"))
-    axis.yaxis.set_major_formatter(_readable(top))
+    axis.yaxis.set_major_formatter(readable(top))
 
 
-def _readable(top: float) -> Callable[..., str]:
+def readable(top: float) -> Callable[..., str]:
     """A tick formatter: 12,000 as 12k, and no digits that the axis does not need."""
     scale, suffix = (1e6, "M") if top >= 10_000_000 else (1e3, "k") if top >= 10_000 else (1, "")
 

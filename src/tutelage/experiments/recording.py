@@ -1,10 +1,12 @@
-"""Subscribers that write a run down. Each can be cut back to a timestep, so that a resumed run leaves no trace of the crash."""
+"""Subscribers that write a run down. Each can be cut back to a timestep: a resumed run leaves no trace of the crash."""
 
 from __future__ import annotations
 
 import json
 import os
 import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -16,6 +18,7 @@ from tutelage.fleet.loop import Loop
 from tutelage.fleet.metrics import Tally
 from tutelage.fleet.modes import MOVING, Mode
 from tutelage.fleet.step import Step
+from tutelage.store import write_atomic
 
 
 class EventStore:
@@ -25,23 +28,28 @@ class EventStore:
     """
 
     def __init__(self, path: Path) -> None:
-        self._db = sqlite3.connect(path)
-        self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=NORMAL")
-        self._db.execute(
-            "CREATE TABLE IF NOT EXISTS events(t INTEGER, robot INTEGER, human INTEGER, event INTEGER, mode INTEGER)"
-        )
-        self._db.commit()
+        try:
+            self._db = sqlite3.connect(path)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=NORMAL")
+            self._db.execute(
+                "CREATE TABLE IF NOT EXISTS events(t INTEGER, robot INTEGER, human INTEGER, event INTEGER, mode INTEGER)"
+            )
+            self._db.commit()
+        except sqlite3.Error as error:
+            raise RunFolderError(f"cannot open {path}: {error}; restore the file or start a new run") from None
 
     def add(self, events: Events) -> None:
         """Append events."""
         if len(events.t):
             rows = np.stack(events, axis=1).tolist()
-            _guard(lambda: self._db.executemany("INSERT INTO events VALUES (?, ?, ?, ?, ?)", rows), "events.sqlite")
+            with _writing("events.sqlite"):
+                self._db.executemany("INSERT INTO events VALUES (?, ?, ?, ?, ?)", rows)
 
     def commit(self) -> None:
         """Make everything so far durable."""
-        _guard(self._db.commit, "events.sqlite")
+        with _writing("events.sqlite"):
+            self._db.commit()
 
     def cut(self, t: int) -> None:
         """Forget timestep t and all later ones."""
@@ -64,25 +72,28 @@ class MetricsFile:
 
     def write(self, row: dict[str, float]) -> None:
         """Append a line."""
-        _guard(lambda: (self._file.write(json.dumps(row) + "\n"), self._file.flush()), self._path.name)
+        with _writing(self._path.name):
+            self._file.write(json.dumps(row) + "\n")
+            self._file.flush()
 
     def commit(self) -> None:
         """Make everything so far durable."""
-        _guard(lambda: (self._file.flush(), os.fsync(self._file.fileno())), self._path.name)
+        with _writing(self._path.name):
+            self._file.flush()
+            os.fsync(self._file.fileno())
 
     def cut(self, t: int) -> None:
         """Keep the lines of the first t timesteps; drop the rest, and a line that a crash left half written."""
         self._file.close()
         kept = []
-        for line in self._path.read_text(encoding="utf-8").splitlines():
+        for line in self._path.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
-                row = json.loads(line)
-            except json.JSONDecodeError:
-                break
-            if row["t"] > t:
+                if json.loads(line)["t"] > t:
+                    break
+            except (json.JSONDecodeError, TypeError, KeyError):
                 break
             kept.append(line + "\n")
-        self._path.write_text("".join(kept), encoding="utf-8")
+        write_atomic(self._path, "".join(kept).encode())  # a crash while resuming must not lose what was kept
         self._file = open(self._path, "a", encoding="utf-8")  # noqa: SIM115
 
     def close(self) -> None:
@@ -152,8 +163,9 @@ class EpisodeFrames:
                 for name, v in whole.items()
             }
             path = self._folder / f"steps-{self._start:08d}-{t:08d}.parquet"
-            part = path.with_suffix(".part")
-            _guard(lambda: (pq.write_table(pa.table(arrays), part), os.replace(part, path)), path.name)
+            content = pa.BufferOutputStream()
+            pq.write_table(pa.table(arrays), content)
+            write_atomic(path, content.getvalue().to_pybytes())
         self._columns, self._start = {}, t
 
     def cut(self, t: int) -> None:
@@ -247,22 +259,27 @@ class Recorder:
             self.frames.load_state_dict(state["frames"])
 
 
-def _guard(write: Any, name: str) -> None:
-    """Do a write; a full disk becomes one clear line."""
+@contextmanager
+def _writing(name: str) -> Iterator[None]:
+    """A full disk becomes one clear line."""
     try:
-        write()
+        yield
     except (OSError, sqlite3.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise TutelageError(f"cannot write {name}: {reason}; free some space, then continue with: tutelage resume") from None
 
 
 def lock(folder: Path) -> TextIO:
-    """Claim a run folder for this process; the claim ends with it.
+    """Claim a run folder for this process, and make it if need be; the claim ends with the process or `close`.
 
     Raises:
-        RunFolderError: another process is running there.
+        RunFolderError: another process is running there, or nothing can be written there.
     """
-    file = open(folder / ".lock", "w")  # noqa: SIM115 - held for the length of the run
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = open(folder / ".lock", "w")  # noqa: SIM115 - held for the length of the run
+    except OSError as error:
+        raise RunFolderError(f"cannot write to {folder}: {error.strerror}; choose another folder") from None
     try:
         import fcntl
 

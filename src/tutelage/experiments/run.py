@@ -8,10 +8,10 @@ import platform
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import tutelage
-from tutelage.errors import RunFolderError
+from tutelage.errors import ContractError, RunFolderError
 from tutelage.experiments.assemble import Assembly, assemble, prepare
 from tutelage.experiments.config import FORMAT, RunConfig, from_json, to_json
 from tutelage.experiments.recording import Recorder, lock
@@ -47,28 +47,36 @@ class Checkpoints:
             self.save(loop)
 
     def save(self, loop: Loop) -> None:
-        """Make recordings durable, then replace the checkpoint and the policy."""
+        """Make recordings durable, then replace the policy and the checkpoint."""
         self._recorder.commit(loop.t)
-        save_tree(self.path, {"format": FORMAT, "loop": loop.state_dict(), "recorder": self._recorder.state_dict()})
         card = {"task": self._assembly.config.task, "t": loop.t, "algorithm": self._assembly.config.algorithm}
         self._assembly.policy.save(self._folder / "policy.safetensors", card)
+        # The checkpoint last: a run that it calls complete has its last policy.
+        save_tree(self.path, {"format": FORMAT, "loop": loop.state_dict(), "recorder": self._recorder.state_dict()})
 
     def load(self, loop: Loop) -> None:
         """Continue from the checkpoint: restore the state, cut the recordings back to it."""
         state = load_tree(self.path)
-        if state.get("format") != FORMAT:
-            raise RunFolderError(f"{self.path} has format {state.get('format')}, this version reads {FORMAT}")
-        loop.load_state_dict(state["loop"])
-        self._recorder.load_state_dict(state["recorder"])
+        found = state.get("format")
+        if found != FORMAT:
+            raise RunFolderError(
+                f"{self.path} has format {found}, this version reads {FORMAT}; use the version that wrote it"
+            )
+        try:
+            loop.load_state_dict(state["loop"])
+            self._recorder.load_state_dict(state["recorder"])
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ContractError):
+            raise RunFolderError(
+                f"{self.path} does not fit {self._folder / 'config.json'}: one of them is damaged or was changed; restore it"
+            ) from None
         self._recorder.cut(loop.t)
 
 
 class Run:
     """A run in its folder: `Run.start(config)` makes a new one, `Run.resume(folder)` continues one; then `.run()`."""
 
-    def __init__(self, folder: Path, assembly: Assembly) -> None:
-        self.folder, self.assembly, self.config = folder, assembly, assembly.config
-        self._lock = lock(folder)
+    def __init__(self, folder: Path, assembly: Assembly, claim: TextIO) -> None:
+        self.folder, self.assembly, self.config, self._claim = folder, assembly, assembly.config, claim
         c = self.config
         self.recorder = Recorder(folder, c.robots, c.humans, c.steps, c.metrics_every, c.record)
         self.loop = assembly.loop()
@@ -83,13 +91,13 @@ class Run:
             ConfigError: see `assemble`.
         """
         folder = config.folder
-        if (folder / "config.json").exists():
-            raise RunFolderError(
-                f"{folder} already holds a run; continue it with: tutelage resume {folder}, or choose --out"
-            )
-        assembly = prepare(assemble(config), report)
-        folder.mkdir(parents=True, exist_ok=True)
-        run = cls(folder, assembly)
+        _check_vacant(folder)
+        assembly = assemble(config)
+        assembly.loop().state_dict()  # what cannot work is refused here, before minutes are spent on preparing
+        claim = lock(folder)
+        _check_vacant(folder)  # another process may have made and left a run while this one assembled
+        assembly = prepare(assembly, report)
+        run = cls(folder, assembly, claim)
         run.checkpoints.save(run.loop)
         write_atomic(folder / "environment.txt", environment().encode())
         # Written last: a folder with a configuration is one that can be continued.
@@ -110,7 +118,8 @@ class Run:
             RunFolderError: no run there, of another version, or in use.
         """
         config = dataclasses.replace(read_config(folder), out=folder)
-        run = cls(folder, assemble(config))
+        claim = lock(folder)
+        run = cls(folder, assemble(config), claim)
         run.checkpoints.load(run.loop)
         return run
 
@@ -121,7 +130,13 @@ class Run:
             self.loop.run(self.config.steps)
         finally:
             self.recorder.close()
+            self._claim.close()
         return self.recorder.tally.summary()
+
+
+def _check_vacant(folder: Path) -> None:
+    if (folder / "config.json").exists():
+        raise RunFolderError(f"{folder} already holds a run; continue it with: tutelage resume {folder}, or choose --out")
 
 
 def read_config(folder: Path) -> RunConfig:
@@ -136,8 +151,8 @@ def read_config(folder: Path) -> RunConfig:
         found = values.pop("format")
     except FileNotFoundError:
         raise RunFolderError(f"{folder} holds no run (no config.json); start one with: tutelage run") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, AttributeError):
-        raise RunFolderError(f"{path} is damaged") from None
+    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError):
+        raise RunFolderError(f"{path} is damaged; restore it, or start a new run in another folder") from None
     if found != FORMAT:
         raise RunFolderError(f"{folder} has format {found}, this version reads {FORMAT}; use the version that wrote it")
     values.pop("version", None)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import multiprocessing
+import sys
 import traceback
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -24,6 +25,7 @@ import numpy as np
 import tyro
 from tyro.conf import Positional
 
+from tutelage.errors import TutelageError
 from tutelage.experiments.config import RunConfig, to_json
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
 from tutelage.fleet.modes import Mode
@@ -160,6 +162,8 @@ def run_study(study: StudyConfig) -> list[dict[str, Any]]:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(study.workers, mp_context=context) as pool:
         reference = _run_all(pool, study, configurations(study, None))
+        if len(reference) < len(study.seeds):
+            raise TutelageError("a run of C.U.R. failed, and its human time sets the others; mend it, then start again")
         human_time = float(np.mean([r["metrics"]["human_time"] for r in reference]))
         print(f"C.U.R. solicited {human_time:,.0f} human timesteps on average", flush=True)
         return reference + _run_all(pool, study, configurations(study, human_time))
@@ -188,7 +192,8 @@ def _run_all(pool: ProcessPoolExecutor, study: StudyConfig, configs: dict[str, R
         write_atomic(file, (json.dumps(result, indent=1) + "\n").encode())
         m, e = result["metrics"], result.get("evaluation", {})
         print(
-            f"{title}: successes {m['successes']:.0f}, hard resets {m['hard_resets']:.0f}, human time {m['human_time']:.0f}, "
+            f"{title}: successes {m['successes']:.0f}, hard resets {m['hard_resets']:.0f}, "
+            f"human time {m['human_time']:.0f}, "
             f"ROHE {m['rohe']:.3f}; frozen: successes {e.get('successes', float('nan')):.0f}",
             flush=True,
         )
@@ -198,7 +203,11 @@ def _run_all(pool: ProcessPoolExecutor, study: StudyConfig, configs: dict[str, R
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of `python -m tutelage.experiments.study`."""
-    run_study(tyro.cli(StudyConfig, args=args, description=__doc__))
+    try:
+        run_study(tyro.cli(StudyConfig, args=args, description=__doc__))
+    except TutelageError as error:
+        print(f"study: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
 
 
 if __name__ == "__main__":

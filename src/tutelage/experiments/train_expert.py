@@ -107,7 +107,8 @@ def finish(config: ExpertConfig, level: str, best_path: Path, say: Callable[[str
     actor.save(path, card)
     for s in scores.values():
         say(
-            f"{config.task} at {s['level']}: {s['mean']:.0f} +- {s['sd']:.0f}, survived {s['survived']:.0%}, {s['episodes']} episodes"
+            f"{config.task} at {s['level']}: {s['mean']:.0f} +- {s['sd']:.0f}, survived {s['survived']:.0%}, "
+            f"success {s['success']:.0%}, {s['episodes']} episodes"
         )
     published = experts.PUBLISHED.get(config.task)
     if published and not experts.is_expert(card):

@@ -88,7 +88,7 @@ def transition(modes: Array, robots: Array, event: Event) -> Array:
     Raises:
         ContractError: the event is not possible in a robot's present mode.
     """
-    after = TABLE[modes[robots], event]
+    after: Array = TABLE[modes[robots], event]
     if (after == INVALID).any():
         robot = int(robots[np.argmax(after == INVALID)])
         raise ContractError(f"robot {robot} is {Mode(modes[robot]).name}: {event.name} cannot happen to it")

@@ -127,11 +127,11 @@ class Critic:
         seed: int,
     ) -> None:
         self.config, self.policy, self.rng, self.scale = config, policy, rng, scale
-        self.worst = (lambda q: q.amax(0)) if event == "bad" else (lambda q: q.amin(0))
-        build = lambda: BatchedMLP(  # noqa: E731
-            2, obs_width + action_width, 1, config.hidden, torch.Generator().manual_seed(seed), last=torch.sigmoid
+        self.event = event
+        self.net, self.target = (
+            BatchedMLP(2, obs_width + action_width, 1, config.hidden, torch.Generator().manual_seed(seed), torch.sigmoid)
+            for _ in range(2)
         )
-        self.net, self.target = build(), build()
         self.optimiser = adam(self.net.parameters(), config.learning_rate)
         self.plain = Ring(config.capacity, obs_width, action_width)
         self.events = Ring(max(1, config.capacity // 10), obs_width, action_width)
@@ -141,7 +141,7 @@ class Critic:
         s, a = (torch.from_numpy(np.asarray(x, np.float32)) for x in (obs, actions))
         with torch.no_grad():
             q = self._q(self.net, s, a)
-        return self.worst(q).numpy()  # type: ignore[no-any-return]
+        return self._worst(q).numpy()
 
     def add(self, obs: Array, action: Array, next_obs: Array, event: Array, end: Array) -> None:
         """Take in n transitions. event: (n,) bool, it happened in this step; end: (n,) bool, nothing can follow."""
@@ -163,7 +163,7 @@ class Critic:
             event[-positives:] = 1.0
         with torch.no_grad():
             then = torch.from_numpy(np.asarray(self.policy.act(batch["next_obs"].numpy()), np.float32))
-            future = self.worst(self._q(self.target, batch["next_obs"], then))
+            future = self._worst(self._q(self.target, batch["next_obs"], then))
             y = event + self.config.gamma * (1 - event) * (1 - batch["end"]) * future
         loss = (self._q(self.net, batch["obs"], batch["action"]) - y).square().mean(dim=1).sum()
         self.optimiser.zero_grad(set_to_none=True)
@@ -172,6 +172,15 @@ class Critic:
         with torch.no_grad():
             torch._foreach_lerp_(list(self.target.parameters()), list(self.net.parameters()), self.config.tau)
         return float(loss.detach()) / 2
+
+    def _worst(self, q: Tensor) -> Tensor:
+        """The more pessimistic twin: (2, B) -> (B,)."""
+        return q.amax(0) if self.event == "bad" else q.amin(0)
+
+    def updates(self, n: int) -> None:
+        """n gradient steps."""
+        for _ in range(n):
+            self.update()
 
     def _q(self, net: BatchedMLP, obs: Tensor, actions: Tensor) -> Tensor:
         """(B, D), (B, A) -> (2, B)."""

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet
 from tutelage.learning.optimiser import load_optimiser_state, optimiser_state
 from tutelage.policies.expert import GaussianActor, tanh_mlp
@@ -58,6 +59,12 @@ class PPOConfig:
     entropy: float = 0.0
     fall_penalty: float = 0.0
     hidden: tuple[int, ...] = (256, 128)
+
+    def __post_init__(self) -> None:
+        if min(self.rollout, self.epochs, self.minibatch, *self.hidden) < 1:
+            raise ConfigError("PPO needs rollout, epochs, minibatch and hidden widths of at least 1")
+        if not (0 <= self.gamma <= 1 and 0 <= self.lam <= 1 and self.learning_rate > 0 and self.target_kl > 0):
+            raise ConfigError("PPO needs gamma and lam in [0, 1], learning_rate > 0 and target_kl > 0")
 
 
 class RunningMoments:
@@ -185,7 +192,7 @@ class PPO:
             "survived": float(np.mean([s for _, s in self.finished] or [float("nan")])),
             "kl": kl,
             "learning_rate": self.learning_rate,
-            "std": float(self.actor.log_std.exp().mean()),
+            "std": float(self.actor.log_std.detach().exp().mean()),
         }
 
     def _adapt(self, kl: float) -> None:
@@ -222,8 +229,17 @@ class PPO:
         )
 
     def load(self, path: Path) -> None:
-        """Go on from what `save` wrote."""
-        tree = load_tree(path)
+        """Go on from what `save` wrote.
+
+        Raises:
+            ContractError: it was written by another fleet, or with other networks.
+        """
+        try:
+            self._restore(load_tree(path))
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ContractError):
+            raise ContractError(f"{path} does not fit this fleet and these settings; use those that wrote it") from None
+
+    def _restore(self, tree: dict[str, Any]) -> None:
         self.steps, self.learning_rate = tree["steps"], tree["learning_rate"]
         load_module_state(self.actor, tree["actor"])
         load_module_state(self.critic, tree["critic"])

@@ -36,9 +36,8 @@ class BatchedMLP(nn.Module):
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for a, b in pairwise(widths):
             bound = 1 / math.sqrt(a)
-            draw = lambda *shape, bound=bound: (torch.rand(shape, generator=generator) * 2 - 1) * bound  # noqa: E731
-            self.weights.append(nn.Parameter(draw(members, a, b)))
-            self.biases.append(nn.Parameter(draw(members, 1, b)))
+            for parameters, shape in ((self.weights, (members, a, b)), (self.biases, (members, 1, b))):
+                parameters.append(nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) * bound))
 
     def forward(self, x: Tensor) -> Tensor:
         """(K, B, inputs), or (B, inputs) for the same inputs to all members -> (K, B, outputs)."""

@@ -15,7 +15,7 @@ class Ant(MujocoTask):
     fields = ("qpos", "qvel", "cfrc_ext", "xpos")
     contact_forces = True
     expert_features = 27
-    disturbance = "light"
+    disturbance = "mild"
     summary = "a quadruped walks forward; violation: torso below 0.2 m or above 1 m"
 
     def observe(self, frame: Frame) -> Array:

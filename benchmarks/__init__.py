@@ -1,0 +1,1 @@
+"""How fast Tutelage is, as ratios on this machine. Nothing here is asserted by a test: see docs/benchmarks.md."""

@@ -1,0 +1,188 @@
+"""The whole loop against code in the usual shape, and against the floor: raw physics plus raw gradient steps."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.fleets import OFFLINE, ready
+from benchmarks.original_loop import OriginalLoop
+from benchmarks.timing import Phases, ratio, table, take_turns
+from tutelage.envs import mujoco_fleet
+from tutelage.envs.engine import Physics, wait
+from tutelage.envs.mujoco_fleet import MujocoFleet
+from tutelage.experiments.assemble import Assembly
+from tutelage.fleet.loop import Loop
+from tutelage.fleet.modes import MOVING
+from tutelage.fleet.step import Step
+
+PRETRAIN = 100
+WARM = 100
+"""Timesteps before the first measurement: at the start, all robots stand upright."""
+
+
+class Headcount:
+    """How many robots moved, on average over the timesteps so far."""
+
+    def __init__(self) -> None:
+        self.counts: list[int] = []
+
+    def on_start(self, loop: Loop) -> None:
+        pass
+
+    def on_step(self, loop: Loop, step: Step) -> None:
+        self.counts.append(int(MOVING[step.mode].sum()))
+
+    def on_end(self, loop: Loop) -> None:
+        pass
+
+    @property
+    def mean(self) -> float:
+        return float(np.mean(self.counts))
+
+
+class Ours:
+    """A loop that goes on from where it was at each call."""
+
+    def __init__(self, task: str, steps: int, overlap: bool) -> None:
+        self.assembly, self.steps, self.moved = ready(task, pretrain=PRETRAIN, overlap=overlap), steps, Headcount()
+        self.torch_threads, self.loop = torch.get_num_threads(), self.assembly.loop()
+        self.loop.subscribers = [self.moved]
+        self.loop.run(WARM)
+
+    def __call__(self) -> None:
+        torch.set_num_threads(self.torch_threads)
+        self.loop.run(self.loop.t + self.steps)
+
+
+class RawPhysics:
+    """Exactly the physics of a stretch of a run, again and again: the engine alone, with the recorded commands."""
+
+    def __init__(self, assembly: Assembly, loop: Loop, steps: int) -> None:
+        fleet = assembly.fleet
+        assert isinstance(fleet, MujocoFleet)
+        self.physics, self.calls = fleet.physics, []
+        self.start = self.physics.get_state()
+        advance, restart = self.physics.advance_async, self.physics.restart
+        self.physics.advance_async = lambda *a: self._note("advance", advance, a)  # type: ignore[method-assign]
+        self.physics.restart = lambda *a: self._note("restart", restart, a)  # type: ignore[method-assign]
+        loop.run(loop.t + steps)
+        self.physics.advance_async, self.physics.restart = advance, restart  # type: ignore[method-assign]
+
+    def _note(self, kind: str, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        self.calls.append((kind, copy.deepcopy(arguments)))
+        return work(*arguments)
+
+    def rewind(self) -> None:
+        """Back to the start of the stretch; not part of what is timed."""
+        self.physics.set_state(self.start)
+
+    def __call__(self) -> None:
+        for kind, arguments in self.calls:
+            if kind == "advance":
+                wait(self.physics.advance_async(*arguments))
+            else:
+                self.physics.restart(*arguments)
+
+
+class RawGradients:
+    """The same updates of policy and critic, always on the same batches: nothing is sampled, acted or recorded."""
+
+    def __init__(self, assembly: Assembly, steps: int) -> None:
+        self.learner, self.steps = assembly.learner, steps
+        batches = self.learner.dataset.batches(assembly.config.learner.batch)
+        self.learner.dataset.batches = lambda size: batches  # type: ignore[method-assign]
+        for critic in self.learner.critics.values():
+            for ring in (critic.plain, critic.events):
+                drawn: dict[int, Any] = {}
+                draw = ring.draw
+                ring.draw = lambda n, rng, drawn=drawn, draw=draw: drawn.get(n) or drawn.setdefault(n, draw(n, rng))  # type: ignore[method-assign]
+
+    def __call__(self) -> None:
+        for t in range(self.steps):
+            self.learner.update(t)
+
+
+def watch(ours: Ours) -> Phases:
+    """Time the phases of a loop from now on."""
+    phases, loop = Phases(), ours.loop
+    learner, fleet = ours.assembly.learner, loop.fleet
+    phases.watch(loop, "step", "loop and events")
+    phases.watch(loop, "_observe", "observe, act")
+    loop.signals = {name: phases.timed(signal, "signals") for name, signal in loop.signals.items()}
+    loop.priority = phases.timed(loop.priority, "priority")  # type: ignore[assignment]
+    phases.watch(loop, "_allocate", "allocation")
+    phases.watch(loop.team, "act", "supervisors")
+    phases.watch(fleet, "step_async", "task code")
+    phases.watch(fleet, "step_wait", "task code")
+    phases.watch(fleet, "reset", "reset")
+    phases.watch(fleet.physics, "restart", "physics")  # type: ignore[attr-defined]
+    phases.watch(learner, "record", "record")
+    phases.watch(learner, "update", "gradients")
+    phases.watch(learner.dataset, "batches", "sampling")
+    for critic in learner.critics.values():
+        for ring in (critic.plain, critic.events):
+            phases.watch(ring, "draw", "sampling")
+    return phases
+
+
+def run(quick: bool = False) -> dict[str, Any]:
+    """Both tasks: milliseconds a timestep, the ratios, and where the rest of the time goes."""
+    rows, where, results = [], [], []
+    for task in ("Walker2d", "Humanoid"):
+        result = measure(task, steps=20 if quick else 40, rounds=3 if quick else 9)
+        ms, ratios = result["milliseconds"], result["ratios"]
+        rows.append([task, *(ms[name] for name in VARIANTS), *ratios.values()])
+        where += [[task, phase, took] for phase, took in result["phases"].items()]
+        results.append({"task": task, **result})
+    print(table(["ms a timestep", *VARIANTS, *result["ratios"]], rows))
+    print()
+    print(table(["ours in lock-step", "phase", "ms a timestep"], where))
+    return {"loop": results}
+
+
+VARIANTS = ("original", "ours", "ours, overlap", "raw physics", "raw gradients")
+
+
+def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
+    """One task; every variant runs `steps` timesteps in each round."""
+    lockstep, overlap, floor = (Ours(task, steps, overlap=o) for o in (False, True, False))
+    physics, gradients = RawPhysics(floor.assembly, floor.loop, steps), RawGradients(floor.assembly, steps)
+    data, moved = lockstep.assembly.learner.dataset, Headcount()
+    original = OriginalLoop(
+        task, lockstep.assembly.config, lockstep.assembly.actor,
+        (data.obs.rows[:OFFLINE].numpy(), data.actions.rows[:OFFLINE].numpy()), PRETRAIN, moved.counts.append,
+    )  # fmt: skip
+    original.run(WARM)
+    for counter in (lockstep.moved, overlap.moved, moved):
+        counter.counts.clear()
+
+    phases = watch(lockstep)
+    phases.watch(mujoco_fleet, "wait", "physics")
+    try:
+        seconds = take_turns(
+            {
+                "original": lambda: original.run(steps), "ours": lockstep, "ours, overlap": overlap,
+                "raw physics": physics, "raw gradients": gradients,
+            }, rounds, before={"raw physics": physics.rewind},
+        )  # fmt: skip
+    finally:
+        mujoco_fleet.wait = wait  # type: ignore[attr-defined]
+    original.envs.close()
+    floors = ("raw physics", "raw gradients")
+    return {
+        "milliseconds": {name: 1e3 * float(np.median(seconds[name])) / steps for name in VARIANTS},
+        "ratios": {
+            "original / ours": ratio(seconds, "original", "ours"),
+            "original / overlap": ratio(seconds, "original", "ours, overlap"),
+            "ours / floor": ratio(seconds, "ours", *floors),
+            "overlap / floor": ratio(seconds, "ours, overlap", *floors),
+        },
+        "robots that moved": {"original": moved.mean, "ours": lockstep.moved.mean, "ours, overlap": overlap.moved.mean},
+        "phases": {name: 1e3 * took / steps / rounds for name, took in sorted(phases.seconds.items(), key=lambda p: -p[1])},
+        "threads": {"physics": lockstep.loop.fleet.physics.threads, "torch": torch.get_num_threads()},  # type: ignore[attr-defined]
+    }

@@ -1,0 +1,93 @@
+"""Runs that are small enough for tests: six robots, tiny networks, on the point fleet or on Walker2d."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fakes import POSITION, PointFleet
+
+from tutelage.experiments.config import RunConfig
+from tutelage.learning.critic import CriticConfig
+from tutelage.learning.imitation import LearnerConfig
+from tutelage.store import load_tree
+
+FLAGS = (
+    "--robots 6 --humans 2 --steps 30 --offline-pairs 1000 --calibration-steps 10 --hidden 16 --learner.pretrain 20 "
+    "--learner.batch 32 --critic.pretrain 20 --critic.hidden 16 --critic.batch 32 --threads 1 --torch-threads 1 "
+    "--checkpoint-every 10 --metrics-every 5 --record all"
+).split()
+"""`walker()` on the command line."""
+
+
+def walker(out: Path, **changes: Any) -> RunConfig:
+    """Walker2d at its own level, with the shipped expert."""
+    learner = {"pretrain": 20, "batch": 32, **changes.pop("learner", {})}
+    settings: dict[str, Any] = {
+        "task": "Walker2d", "robots": 6, "humans": 2, "steps": 30, "offline_pairs": 1000, "calibration_steps": 10,
+        "hidden": (16,), "critic": CriticConfig(pretrain=20, hidden=(16,), batch=32), "threads": 1, "torch_threads": 1,
+        "checkpoint_every": 10, "metrics_every": 5, "record": "all", "out": out,
+    }  # fmt: skip
+    return RunConfig(**{**settings, "learner": LearnerConfig(**learner), **changes})
+
+
+def points(out: Path, **changes: Any) -> RunConfig:
+    """Points on a line that are pushed about, with a human who brings them home."""
+    settings = {"task": "small:point_fleet", "expert": "small:Homing", "offline_pairs": 100, "threads": None}
+    return walker(out, **{**settings, **changes})
+
+
+def point_fleet(num_envs: int) -> PointFleet:
+    """A fleet of the user's own: it knows no levels of disturbance and no threads."""
+    return PointFleet(num_envs, bound=0.6, horizon=25, noise=0.08, start=0.3)
+
+
+class Homing:
+    """The way home."""
+
+    def act(self, obs: Any) -> Any:
+        return np.clip(-5 * obs[:, [POSITION]], -1, 1).astype(np.float32)
+
+
+class GoalFleet(PointFleet):
+    """Points with a goal state."""
+
+    goal_conditioned = True
+
+
+def goal_fleet(num_envs: int) -> GoalFleet:
+    return GoalFleet(num_envs, bound=0.9, goal=0.35, horizon=25, noise=0.05, start=0.3)
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """What a run left behind, to be compared: metrics to the byte, events, frames and weights to the bit."""
+    import pyarrow.parquet as pq
+
+    with closing(sqlite3.connect(folder / "events.sqlite")) as database:
+        events = database.execute("SELECT t, robot, human, event, mode FROM events ORDER BY rowid").fetchall()
+    frames = [row for path in sorted(folder.glob("episodes/*.parquet")) for row in pq.read_table(path).to_pylist()]
+    weights = load_tree(folder / "policy.safetensors")["weights"]
+    return {
+        "metrics": (folder / "metrics.jsonl").read_bytes(),
+        "events": events,
+        "frames": frames,
+        "weights": {name: array.tobytes() for name, array in weights.items()},
+    }
+
+
+def assert_same(one: Path, other: Path) -> None:
+    """Two run folders tell the same story."""
+    a, b = contents(one), contents(other)
+    assert a["events"], "a comparison of nothing"
+    for name in a:
+        assert a[name] == b[name], f"{name} differ"
+
+
+def edit_config(folder: Path, **changes: Any) -> None:
+    """Change the stored configuration of a run."""
+    path = folder / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
