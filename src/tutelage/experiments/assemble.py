@@ -37,10 +37,6 @@ Array = NDArray[Any]
 Report = Callable[[str, float], None]
 """Told what is being prepared, and how much of it is done (0 to 1)."""
 
-INITIAL_PERIOD = {"Humanoid": 1000, "Walker2d": 250, "Ant": 250, "HalfCheetah": 250}
-"""t_I of C.U.R. a task; the dissertation's for Humanoid (table C.1), its Anymal's for the other walkers."""
-
-
 @dataclass
 class Assembly:
     """The parts of a run, before anything is learned."""
@@ -132,8 +128,9 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
 
 def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Array, Array]:
     """Offline data of the human: obs (n, D) float32, actions (n, A). Whole episodes, one a robot; falls are left out."""
-    episodes = max(1, round(config.offline_pairs / horizon))
-    length = min(horizon, -(-config.offline_pairs // episodes))
+    wanted = config.offline_pairs or MujocoTask.offline_pairs
+    episodes = max(1, round(wanted / horizon))
+    length = min(horizon, -(-wanted // episodes))
     spare = episodes + 2 + episodes // 4  # the human repeats a demonstration that failed
     make = find_task(config.task)
     disturbed = config.disturbance is not None or (isinstance(make, type) and issubclass(make, MujocoTask))
@@ -152,7 +149,7 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
         raise ConfigError(f"the expert fell in {spare - len(good)} of {spare} demonstrations; choose a calmer level")
     keep = good[:episodes]
     pairs = [np.stack(rows, axis=1)[keep].reshape(episodes * length, -1) for rows in (seen, done)]
-    return pairs[0][: config.offline_pairs], pairs[1][: config.offline_pairs]
+    return pairs[0][:wanted], pairs[1][:wanted]
 
 
 def _calibrate(assembly: Assembly, report: Report) -> dict[str, Any]:
@@ -191,10 +188,13 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
     """Fill in what the task and the priority decide."""
     changes: dict[str, Any] = {}
     t = config.thresholds
-    if config.disturbance is None and config.task in TASKS:
-        changes["disturbance"] = TASKS[config.task].disturbance
+    task = TASKS.get(config.task)
+    if config.disturbance is None and task:
+        changes["disturbance"] = task.disturbance
+    if config.offline_pairs is None:
+        changes["offline_pairs"] = (task or MujocoTask).offline_pairs
     if t.initial is None:
-        initial = INITIAL_PERIOD.get(config.task, 0) if config.priority.strip(".") == "C.U.R" else 0
+        initial = task.initial_period if task and config.priority.strip(".") == "C.U.R" else 0
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
     if set(config.priority.split(".")) <= {"C", ""}:
         # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).

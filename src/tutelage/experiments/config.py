@@ -38,7 +38,8 @@ class RunConfig:
         t_reset: t_R, timesteps of a hard reset.
         latency: L, timesteps between an assignment and its beginning; the robot waits.
         disturbance: level of the world's disturbances; default: the task's own.
-        offline_pairs: state-action pairs of the human before the run, in whole episodes of the supervisor.
+        offline_pairs: state-action pairs of the human before the run, in whole episodes of the supervisor; default:
+            the task's own.
         offline_disturbance: level of disturbance while those were recorded (demonstrations are given in calm).
         calibration_steps: timesteps that the cloned policy runs alone before the run; from them come the thresholds
             and the first data of the critics (appendix C.3: about 20,000 transitions).
@@ -71,7 +72,7 @@ class RunConfig:
     t_reset: int = 5
     latency: int = 0
     disturbance: str | None = None
-    offline_pairs: int = 5000
+    offline_pairs: int | None = None
     offline_disturbance: str = "none"
     calibration_steps: int = 200
     thresholds: PriorityConfig = field(default_factory=PriorityConfig)
@@ -93,7 +94,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         at_least = {
-            "robots": 1, "humans": 1, "steps": 1, "t_teleop": 1, "t_reset": 1, "latency": 0, "offline_pairs": 1,
+            "robots": 1, "humans": 1, "steps": 1, "t_teleop": 1, "t_reset": 1, "latency": 0,
             "calibration_steps": 1, "members": 1, "torch_threads": 1, "checkpoint_every": 1, "metrics_every": 1, "seed": 0,
         }  # fmt: skip
         for name, least in at_least.items():
@@ -107,6 +108,8 @@ class RunConfig:
             raise ConfigError(f"hidden layers must be at least 1 wide, got {self.hidden}")
         if self.record not in ("human", "all", "none"):
             raise ConfigError(f"unknown record {self.record!r}: use human, all or none")
+        if self.offline_pairs is not None and self.offline_pairs < 1:
+            raise ConfigError(f"offline_pairs must be at least 1, got {self.offline_pairs}")
         if self.threads is not None and self.threads < 1:
             raise ConfigError(f"threads must be at least 1, got {self.threads}")
 

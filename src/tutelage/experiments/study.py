@@ -26,6 +26,7 @@ import tyro
 from tyro.conf import Positional
 
 from tutelage.errors import TutelageError
+from tutelage.envs.tasks import TASKS
 from tutelage.experiments.config import RunConfig, to_json
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
 from tutelage.fleet.modes import Mode
@@ -122,7 +123,7 @@ def configurations(study: StudyConfig, human_time: float | None) -> dict[str, Ru
             priority="C.",
             label=BEHAVIOUR_CLONING,
             learner=cloning,
-            offline_pairs=base.offline_pairs + round(human_time),
+            offline_pairs=TASKS[study.task].offline_pairs + round(human_time),
         ),
         "Random": with_(base, priority="Random.", label="Random", thresholds=PriorityConfig(random=threshold)),
         "U.C.": with_(base, priority="U.C.", label="U.C."),

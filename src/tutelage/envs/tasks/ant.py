@@ -16,6 +16,7 @@ class Ant(MujocoTask):
     contact_forces = True
     expert_features = 27
     disturbance = "mild"
+    offline_pairs = 500
     summary = "a quadruped walks forward; violation: torso below 0.2 m or above 1 m"
 
     def observe(self, frame: Frame) -> Array:

@@ -30,6 +30,10 @@ class MujocoTask(ABC):
     horizon: ClassVar[int] = 1000
     disturbance: ClassVar[str] = "none"
     """The level at which the task is benchmarked (fixed by the rule in docs/tasks.md)."""
+    offline_pairs: ClassVar[int] = 5000
+    """State-action pairs of the human before a run (fixed by the same rule)."""
+    initial_period: ClassVar[int] = 250
+    """t_I of C.U.R., timesteps (table C.1)."""
     expert_features: ClassVar[int | None] = None
     """The expert sees only the first so many numbers of an observation; None: all."""
     symmetry: ClassVar[tuple[Array, Array] | None] = None

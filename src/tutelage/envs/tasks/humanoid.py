@@ -16,6 +16,7 @@ class Humanoid(MujocoTask):
     contact_forces = True
     expert_features = 45
     disturbance = "light"
+    initial_period = 1000
     summary = "a humanoid walks forward; violation: torso below 1 m or above 2 m"
 
     def observe(self, frame: Frame) -> Array:

@@ -1,0 +1,207 @@
+"""The documentation is held against the code: layout, links, commands, the table of modes."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from tutelage.cli import main
+from tutelage.fleet.modes import INVALID, TABLE, Event, Mode
+from tutelage.fleet.priority import TERMS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "results").glob("*.md")],
+)
+FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+GENERATED = {"runs", "site", "dist"}
+
+
+def name(page: Path) -> str:
+    """Of a page, in the names of tests."""
+    return str(page.relative_to(ROOT))
+
+
+# -- layout ---------------------------------------------------------------------------------------------------------------
+
+
+def layout() -> list[str]:
+    """The paths of the README's layout."""
+    block = re.search(r"^## Layout\n\n```text\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert block, "the README has no layout"
+    paths, parent = [], ""
+    for line in block[1].splitlines():
+        entry = line.split()[0]
+        if line.startswith(" "):
+            paths.append(parent + entry)
+        else:
+            parent = entry
+            paths.append(entry)
+    return paths
+
+
+@pytest.mark.parametrize("path", layout())
+def test_the_readme_shows_what_exists(path: str) -> None:
+    found = ROOT / path
+    assert found.is_dir() if path.endswith("/") else found.is_file()
+
+
+def test_the_readme_shows_every_folder_of_the_project() -> None:
+    folders = {f"{path.name}/" for path in ROOT.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    shown = {path.split("/")[0] + "/" for path in layout()}
+    assert folders - {f"{folder}/" for folder in GENERATED} <= shown
+
+
+def test_the_readme_shows_every_part_of_the_package() -> None:
+    package = ROOT / "src" / "tutelage"
+    parts = {f"{path.name}/" for path in package.iterdir() if (path / "__init__.py").exists()}
+    parts |= {path.name for path in package.glob("*.py") if path.name != "__init__.py"}
+    assert {f"src/tutelage/{part}" for part in parts} <= set(layout())
+
+
+# -- links ----------------------------------------------------------------------------------------------------------------
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MkDocs make them."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"\w+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{link} leads nowhere"
+        assert not anchor or anchor in anchors(target), f"{link}: no such heading"
+
+
+def test_pages_of_the_site_link_to_nothing_outside_of_it() -> None:
+    for page in (ROOT / "docs").rglob("*.md"):
+        assert "](../" not in page.read_text(encoding="utf-8"), name(page)
+
+
+# -- commands -------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def manual(verb: str) -> str | None:
+    """What `tutelage VERB --help` prints; None: there is no such verb."""
+    import io
+    from contextlib import redirect_stderr, redirect_stdout
+
+    out = io.StringIO()
+    with redirect_stdout(out), redirect_stderr(out), pytest.raises(SystemExit) as end:
+        main([verb, "--help"])
+    return None if end.value.code else out.getvalue()
+
+
+def commands(page: Path) -> list[str]:
+    """The command lines of a page that begin with `tutelage`, in code blocks and in code spans."""
+    text = page.read_text(encoding="utf-8")
+    found = re.findall(r"(?:^|[`$ ])tutelage (?=[a-z])([^`\n]*)", text, re.MULTILINE)
+    in_code = re.findall(r"```.*?```|`[^`\n]+`", text, re.DOTALL)
+    return [command for command in found if any(f"tutelage {command}" in code for code in in_code)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_and_their_options_exist(page: Path) -> None:
+    for command in commands(page):
+        verb, *words = command.partition("  #")[0].split()
+        text = manual(verb)
+        assert text is not None, f"tutelage {command}: no such verb"
+        for option in (word.partition("=")[0] for word in words if word.startswith("--")):
+            assert option in text, f"tutelage {command}: {verb} has no option {option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_options_in_code_spans_exist(page: Path) -> None:
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    own = {"--check", "--write", "--strict", "--seeds", "--ablations"}  # of tables, run_examples, mypy, study
+    known = "".join(filter(None, map(manual, ("run", "evaluate", "report", "train-expert", "check"))))
+    for option in set(re.findall(r"`(--[a-z][\w.-]*)", text)) - own:
+        assert option in known, f"no verb has {option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_modules_that_are_run_exist(page: Path) -> None:
+    for module in re.findall(r"python -m (tutelage[\w.]*)", page.read_text(encoding="utf-8")):
+        assert (ROOT / "src" / Path(*module.split("."))).with_suffix(".py").exists(), module
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_files_and_modules_in_code_spans_exist(page: Path) -> None:
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for path in re.findall(r"`((?:src|examples|tests|docs|results)/[\w./-]*)`", text):
+        assert (ROOT / path).exists(), path
+    for module in re.findall(r"`(tutelage(?:\.[a-z_]\w*)+)`", text):
+        at = (ROOT / "src" / Path(*module.split(".")))
+        inside = at.parent.with_suffix(".py")
+        holds = inside.exists() and re.search(rf"\b{at.name}\b", inside.read_text(encoding="utf-8"))
+        assert at.with_suffix(".py").exists() or at.is_dir() or holds or module == "tutelage.tasks", module
+
+
+def test_make_targets_in_the_pages_exist() -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        asked = set(re.findall(r"^make ([a-z]+)", text, re.MULTILINE)) | set(re.findall(r"`make ([a-z]+)`", text))
+        assert asked <= targets, name(page)
+
+
+def test_ci_runs_the_tests_first() -> None:
+    script = ROOT / ".ci" / "run"
+    assert os.access(script, os.X_OK)
+    assert re.findall(r"^step (\w+)", script.read_text(), re.MULTILINE) == ["test", "lint", "examples", "docs"]
+
+
+# -- tables that repeat the code --------------------------------------------------------------------------------------------
+
+
+def modes_table() -> str:
+    """The table of modes and events as Markdown."""
+    from tutelage.experiments.tables import markdown
+
+    rows = [
+        [f"**{mode.name}**", *("" if TABLE[mode, event] == INVALID else Mode(TABLE[mode, event]).name for event in Event)]
+        for mode in Mode
+    ]
+    return markdown(["from \\ event", *(f"{event.name}" for event in Event)], rows).replace("---:", "---")
+
+
+def test_the_table_of_modes_is_that_of_the_code() -> None:
+    page = (ROOT / "docs" / "concepts.md").read_text(encoding="utf-8")
+    between = re.search(r"<!-- begin: modes -->(.*?)<!-- end: modes -->", page, re.DOTALL)
+    assert between
+    assert between[1].strip() == modes_table().strip(), "run: python tests/test_docs.py"
+
+
+def test_every_term_of_a_priority_is_documented() -> None:
+    page = (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8")
+    listed = re.search(r"\$ tutelage info priorities\n(.*?)```", page, re.DOTALL)
+    assert listed
+    assert set(TERMS) <= {line.split()[0] for line in listed[1].splitlines() if line.strip()}
+
+
+def test_the_first_example_is_the_program_of_the_readme() -> None:
+    program = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert program
+    assert (ROOT / "examples" / "01_first_run.py").read_text().endswith(program[1])
+
+
+if __name__ == "__main__":
+    from tutelage.experiments.tables import insert
+
+    concepts = ROOT / "docs" / "concepts.md"
+    concepts.write_text(insert(concepts.read_text(encoding="utf-8"), "modes", modes_table()), encoding="utf-8")
+    sys.stdout.write(f"written: {concepts}\n")
