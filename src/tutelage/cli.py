@@ -24,35 +24,48 @@ if TYPE_CHECKING:
 
     from tutelage.experiments.run import Run
     from tutelage.fleet.loop import Loop
+    from tutelage.fleet.step import Subscriber
 
 console = Console(markup=False, width=None if sys.stdout.isatty() else 200)
 """Without markup, as names of folders may contain brackets; wide where there is no terminal, so that lines stay lines."""
 
 
-def run(config: Annotated[RunConfig, arg(name="")]) -> None:
-    """Interactive fleet learning with algorithmic supervisors; leaves a run folder that can be continued."""
+def run(config: Annotated[RunConfig, arg(name="")], tensorboard: bool = False) -> None:
+    """Interactive fleet learning with algorithmic supervisors; leaves a run folder that can be continued.
+
+    Args:
+        config: the run.
+        tensorboard: write the metrics for TensorBoard too, into the run folder (extra tensorboard).
+    """
+    from tutelage.experiments.live import TensorBoard
     from tutelage.experiments.run import Run
 
+    if tensorboard:
+        TensorBoard.writer()  # before minutes of preparation
     with console.status(f"preparing {config.folder}") as status:
         prepared = Run.start(config, lambda what, done: status.update(f"{what} {done:.0%}" if done else what))
-    _go(prepared)
+    _go(prepared, tensorboard)
 
 
-def resume(folder: Positional[Path]) -> None:
+def resume(folder: Positional[Path], tensorboard: bool = False) -> None:
     """Continue a run from its last checkpoint, as if it had never stopped.
 
     Args:
         folder: the run folder.
+        tensorboard: write the metrics for TensorBoard too, into the run folder (extra tensorboard).
     """
+    from tutelage.experiments.live import TensorBoard
     from tutelage.experiments.run import Run
 
+    if tensorboard:
+        TensorBoard.writer()  # before minutes of preparation
     with console.status(f"loading {folder}"):
         continued = Run.resume(folder)
     if continued.loop.t >= continued.config.steps:
         console.print(f"{folder} is complete at timestep {continued.loop.t}; nothing to do")
         return
     console.print(f"continuing at timestep {continued.loop.t} of {continued.config.steps}")
-    _go(continued)
+    _go(continued, tensorboard)
 
 
 def evaluate(
@@ -187,15 +200,18 @@ def _supervisor(task: str, level: str) -> list[str]:
     ]
 
 
-def _go(prepared: Run) -> None:
+def _go(prepared: Run, tensorboard: bool) -> None:
     """Run with a progress display and plots; Ctrl-C ends it after the present timestep, with nothing lost."""
-    from tutelage.experiments.live import LivePlots
+    from tutelage.experiments.live import LivePlots, TensorBoard
     from tutelage.experiments.progress import ProgressDisplay
 
     c = prepared.config
     display = ProgressDisplay(f"{c.task} {c.algorithm}", c.steps, prepared.recorder.tally, console)
+    listeners: list[Subscriber] = [display, LivePlots(prepared.folder)]
+    if tensorboard:
+        listeners.append(TensorBoard(prepared.folder, prepared.recorder))
     with _interruptible(prepared.loop):
-        metrics = prepared.run([display, LivePlots(prepared.folder)])
+        metrics = prepared.run(listeners)
     if prepared.loop.t < c.steps:
         console.print(
             f"stopped at timestep {prepared.loop.t}; continue with: tutelage resume {prepared.folder}", soft_wrap=True

@@ -37,6 +37,7 @@ Array = NDArray[Any]
 Report = Callable[[str, float], None]
 """Told what is being prepared, and how much of it is done (0 to 1)."""
 
+
 @dataclass
 class Assembly:
     """The parts of a run, before anything is learned."""

@@ -1,11 +1,13 @@
-"""Plots that follow a run: `plots/curves.png` is drawn anew while it goes on, and at its end."""
+"""Plots that follow a run: `plots/curves.png`, drawn anew while it goes on, and TensorBoard for those who ask."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 from tutelage.errors import MissingExtraError, TutelageError
+from tutelage.experiments.recording import Recorder
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.step import Step
 
@@ -46,3 +48,38 @@ class LivePlots:
             self._seconds = float("inf")
         except TutelageError:  # no line of metrics yet, or a full disk, which the recorder will report
             pass
+
+
+class TensorBoard:
+    """Writes the metrics of `metrics.jsonl` to `tensorboard/` in the run folder as well (extra `tensorboard`).
+
+    Args:
+        folder: the run folder.
+        recorder: whose metrics.
+    """
+
+    def __init__(self, folder: Path, recorder: Recorder) -> None:
+        self._writer = self.writer()(folder / "tensorboard")
+        self._recorder = recorder
+
+    @staticmethod
+    def writer() -> Any:
+        """The class that writes, or a `MissingExtraError`."""
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            raise MissingExtraError("tensorboard", "tensorboard") from None
+        return SummaryWriter
+
+    def on_start(self, loop: Loop) -> None:
+        """Nothing to do."""
+
+    def on_step(self, loop: Loop, step: Step) -> None:
+        """Write what the recorder writes, when it does."""
+        if loop.t % self._recorder.every == 0 or loop.t == self._recorder.steps:
+            for name, value in self._recorder.row().items():
+                self._writer.add_scalar(name, value, loop.t)
+
+    def on_end(self, loop: Loop) -> None:
+        """Close the files."""
+        self._writer.close()

@@ -63,6 +63,8 @@ class Checkpoints:
                 f"{self.path} has format {found}, this version reads {FORMAT}; use the version that wrote it"
             )
         try:
+            if (len(state["loop"]["mode"]), len(state["loop"]["robot_of"])) != (loop.fleet.num_envs, len(loop.team)):
+                raise ValueError
             loop.load_state_dict(state["loop"])
             self._recorder.load_state_dict(state["recorder"])
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ContractError):

@@ -25,8 +25,8 @@ import numpy as np
 import tyro
 from tyro.conf import Positional
 
-from tutelage.errors import TutelageError
 from tutelage.envs.tasks import TASKS
+from tutelage.errors import TutelageError
 from tutelage.experiments.config import RunConfig, to_json
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
 from tutelage.fleet.modes import Mode

@@ -1,0 +1,104 @@
+"""How hard is a level of disturbance? The rule by which each task's level was fixed, before any comparison.
+
+    python -m tutelage.experiments.levels Walker2d
+
+A level suits a comparison of interactive learners when the expert succeeds in more than 90 % of the episodes and behaviour
+cloning on the offline data in less than 20 %: then help is possible, and needed. Measured on a seed that no comparison uses.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from tyro.conf import Positional
+
+from tutelage.envs import experts
+from tutelage.envs.tasks import TASKS
+from tutelage.experiments.assemble import assemble, prepare
+from tutelage.experiments.config import RunConfig
+from tutelage.seeding import derive
+from tutelage.store import write_atomic
+
+
+@dataclass(frozen=True)
+class LevelsConfig:
+    """What to measure.
+
+    Attributes:
+        task: name of a task.
+        levels: levels of disturbance; default: the task's own.
+        episodes: robots, one episode each.
+        seed: root seed; one that no comparison uses.
+        threads: physics threads.
+        results: file to which the measurements are added.
+    """
+
+    task: Positional[str]
+    levels: tuple[str, ...] = ()
+    episodes: int = 100
+    seed: int = 100
+    threads: int | None = None
+    results: Path = Path("results/levels.json")
+
+
+def behaviour_cloning(task: str, level: str, episodes: int, seed: int, threads: int | None) -> dict[str, float]:
+    """Success and survival of the policy with which a run begins, over one episode on each robot."""
+    config = RunConfig(
+        task, priority="C.", disturbance=level, robots=episodes, humans=1, seed=seed, threads=threads, torch_threads=1
+    )
+    assembly = prepare(assemble(config))
+    fleet, policy = assembly.fleet, assembly.policy
+    obs, info = fleet.reset(seed=derive(seed, "levels") % 2**32)
+    for _ in range(fleet.horizon):
+        obs, _, _, _, info = fleet.step(policy.act(obs))
+    fleet.close()
+    return {"success": float(info["success"].mean()), "survived": float((~info["violation"]).mean())}
+
+
+def measure(config: LevelsConfig) -> list[dict[str, object]]:
+    """Expert and behaviour cloning at each level."""
+    actor, _ = experts.load(config.task)
+    rows: list[dict[str, object]] = []
+    for level in config.levels or (TASKS[config.task].disturbance,):
+        expert = experts.evaluate(actor, config.task, level, config.episodes, config.seed, config.threads)
+        cloned = behaviour_cloning(config.task, level, config.episodes, config.seed, config.threads)
+        suits = expert.success > 0.9 and cloned["success"] < 0.2
+        rows.append(
+            {
+                "level": level,
+                "chosen": level == TASKS[config.task].disturbance,
+                "expert_success": expert.success,
+                "expert_return": round(expert.mean, 1),
+                "bc_success": cloned["success"],
+                "bc_survived": cloned["survived"],
+                "offline_pairs": TASKS[config.task].offline_pairs,
+                "episodes": config.episodes,
+                "seed": config.seed,
+                "suits": suits,
+            }
+        )
+        print(
+            f"{config.task} at {level}: the expert succeeds in {expert.success:.0%}, behaviour cloning in "
+            f"{cloned['success']:.0%} (survives {cloned['survived']:.0%}): "
+            f"{'suits' if suits else 'does not suit'} a comparison",
+            flush=True,
+        )
+    return rows
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of `python -m tutelage.experiments.levels`."""
+    config = tyro.cli(LevelsConfig, args=args, description=__doc__)
+    known = json.loads(config.results.read_text()) if config.results.exists() else {}
+    new = measure(config)
+    kept = [row for row in known.get(config.task, []) if row["level"] not in {r["level"] for r in new}]
+    known[config.task] = kept + new
+    write_atomic(config.results, (json.dumps(known, indent=1, sort_keys=True) + "\n").encode())
+
+
+if __name__ == "__main__":
+    main()
