@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
 DEMO := runs/demo
 
-.PHONY: demo test lint docs examples bench clean help
+.PHONY: demo test lint docs examples results bench clean help
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -31,7 +31,11 @@ examples: $(INSTALLED) ## the code of the README and the examples
 
 docs: $(INSTALLED) ## the documentation as a web site, in site/
 	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
-	$(BIN)/mkdocs build --strict
+	$(BIN)/python -m tutelage.experiments.tables results/fleet --check
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+results: $(INSTALLED) ## the tables and figures of docs/results.md, from results/
+	$(BIN)/python -m tutelage.experiments.tables results/fleet
 
 bench: $(INSTALLED) ## the speed claims, as ratios on this machine
 	$(BIN)/python -m benchmarks

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from tutelage.experiments import plots
 from tutelage.experiments.config import RunConfig
-from tutelage.experiments.report import load_runs, summary_table, write_report
+from tutelage.experiments.records import load_runs
+from tutelage.experiments.report import summary_table, write_report
 from tutelage.experiments.run import Run
 from tutelage.learning.imitation import LearnerConfig
 

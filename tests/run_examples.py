@@ -9,8 +9,8 @@ A block runs if the line before its fence is one of
     <!-- run -->            it must exit with 0
     <!-- run: output -->    (console blocks) and print what the page says
 
-`python` blocks are programs, `console` blocks are lines of "$ command" and output, `sh` blocks are scripts. The blocks of one
-page share a folder and run in their order.
+`python` blocks are programs, `console` blocks are lines of "$ command" and output, `sh` blocks are scripts. The blocks of
+one page share a folder and run in their order.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^<!-- run(?P<output>: output)? -->\n```(?P<kind>\w+)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
+OTHERWISE = "prints something else; run: python tests/run_examples.py --write"
 LIMIT = 600  # seconds; a hanging command must not hang the build
 
 
@@ -42,7 +43,7 @@ class Outcome:
 def environment() -> dict[str, str]:
     """That of a terminal without colours, in which `tutelage` and `python` are those of this interpreter."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    return {**os.environ, "PATH": path, "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": "."}
+    return {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "PATH": path, "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": "."}
 
 
 def execute(command: list[str], folder: Path) -> Outcome:
@@ -91,7 +92,9 @@ def run_page(path: Path, write: bool) -> int:
             stale = bool(block["output"]) and outcome.code == 0 and tidy(shown) != tidy(body)
             line = text.count("\n", 0, block.start()) + 3
             name = f"{path.relative_to(ROOT)}:{line} {kind}"
-            report(name, outcome, "prints something else; run: python tests/run_examples.py --write" if stale else "")
+            if write and stale:
+                print(f"      {name}: renewed")
+            report(name, outcome, OTHERWISE if stale and not write else "")
             if stale and not write:
                 print(f"--- now it prints\n{shown}---")
             failures += outcome.code != 0 or (stale and not write)

@@ -16,11 +16,40 @@ from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
 from tutelage.store import load_tree
 
-FLAGS = (
-    "--robots 6 --humans 2 --steps 30 --offline-pairs 1000 --calibration-steps 10 --hidden 16 --learner.pretrain 20 "
-    "--learner.batch 32 --critic.pretrain 20 --critic.hidden 16 --critic.batch 32 --threads 1 --torch-threads 1 "
-    "--checkpoint-every 10 --metrics-every 5 --record all"
-).split()
+FLAGS = [
+    "--robots",
+    "6",
+    "--humans",
+    "2",
+    "--steps",
+    "30",
+    "--offline-pairs",
+    "1000",
+    "--calibration-steps",
+    "10",
+    "--hidden",
+    "16",
+    "--learner.pretrain",
+    "20",
+    "--learner.batch",
+    "32",
+    "--critic.pretrain",
+    "20",
+    "--critic.hidden",
+    "16",
+    "--critic.batch",
+    "32",
+    "--threads",
+    "1",
+    "--torch-threads",
+    "1",
+    "--checkpoint-every",
+    "10",
+    "--metrics-every",
+    "5",
+    "--record",
+    "all",
+]
 """`walker()` on the command line."""
 
 
@@ -60,7 +89,7 @@ class GoalFleet(PointFleet):
 
 
 def goal_fleet(num_envs: int) -> GoalFleet:
-    return GoalFleet(num_envs, bound=0.9, goal=0.35, horizon=25, noise=0.05, start=0.3)
+    return GoalFleet(num_envs, bound=0.9, goal=0.15, horizon=25, noise=0.05, start=0.3)
 
 
 def contents(folder: Path) -> dict[str, Any]:

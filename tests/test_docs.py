@@ -5,14 +5,18 @@ from __future__ import annotations
 import os
 import re
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 from tutelage.cli import main
+from tutelage.envs.tasks import TASKS, MujocoTask
+from tutelage.experiments.config import RunConfig
 from tutelage.fleet.modes import INVALID, TABLE, Event, Mode
 from tutelage.fleet.priority import TERMS
+from tutelage.learning.critic import CriticConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -142,10 +146,10 @@ def test_modules_that_are_run_exist(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_files_and_modules_in_code_spans_exist(page: Path) -> None:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
-    for path in re.findall(r"`((?:src|examples|tests|docs|results)/[\w./-]*)`", text):
+    for path in re.findall(r"`((?:src|examples|tests|docs)/[\w./-]*)`", text):
         assert (ROOT / path).exists(), path
     for module in re.findall(r"`(tutelage(?:\.[a-z_]\w*)+)`", text):
-        at = (ROOT / "src" / Path(*module.split(".")))
+        at = ROOT / "src" / Path(*module.split("."))
         inside = at.parent.with_suffix(".py")
         holds = inside.exists() and re.search(rf"\b{at.name}\b", inside.read_text(encoding="utf-8"))
         assert at.with_suffix(".py").exists() or at.is_dir() or holds or module == "tutelage.tasks", module
@@ -157,6 +161,14 @@ def test_make_targets_in_the_pages_exist() -> None:
         text = page.read_text(encoding="utf-8")
         asked = set(re.findall(r"^make ([a-z]+)", text, re.MULTILINE)) | set(re.findall(r"`make ([a-z]+)`", text))
         assert asked <= targets, name(page)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md"])
+def test_the_extras_of_the_package_are_listed(page: str) -> None:
+    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    table = re.search(r"\| extra \| for \|\n\|---\|---\|\n((?:\|.*\n)+)", (ROOT / page).read_text())
+    assert table
+    assert {name for row in table[1].splitlines() for name in re.findall(r"`(\w+)`", row.split("|")[1])} == extras
 
 
 def test_ci_runs_the_tests_first() -> None:
@@ -191,6 +203,29 @@ def test_every_term_of_a_priority_is_documented() -> None:
     listed = re.search(r"\$ tutelage info priorities\n(.*?)```", page, re.DOTALL)
     assert listed
     assert set(TERMS) <= {line.split()[0] for line in listed[1].splitlines() if line.strip()}
+
+
+def test_the_numbers_of_the_algorithms_are_the_defaults() -> None:
+    page = re.sub(r"\s+", " ", (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8"))
+    run, critic = RunConfig("Walker2d"), CriticConfig()
+    periods = {task.initial_period for task in TASKS.values() if task.name != "Humanoid"}
+    assert len(periods) == 1
+    for said in (
+        f"the {run.thresholds.uncertainty_quantile} quantile of its uncertainty",
+        f"the {run.thresholds.risk_quantile} quantile of its risk",
+        f"(`--calibration-steps`, {run.calibration_steps})",
+        f"t_I is {TASKS['Humanoid'].initial_period:,} for Humanoid and {periods.pop()} for the other tasks",
+        f"({critic.pretrain:,} gradient steps, a quarter of each batch violations)",
+        f"discount is {critic.gamma} and their target moves by {critic.tau} a gradient step",
+        f"updated every {critic.every} timesteps",
+        f"an ensemble of {run.members} networks ({len(run.hidden)} × {run.hidden[0]} ReLU",
+        f"| offline pairs | {MujocoTask.offline_pairs:,}, but {TASKS['Ant'].offline_pairs} for Ant;",
+        f"| gradient steps before the run | {run.learner.pretrain:,} |",
+        f"| gradient steps a timestep | {run.learner.gradient_steps}, of {run.learner.batch} pairs a member |",
+    ):
+        assert said in page, said
+    assert critic.positives == 0.25
+    assert {name for name, task in TASKS.items() if task.offline_pairs != MujocoTask.offline_pairs} == {"Ant"}
 
 
 def test_the_first_example_is_the_program_of_the_readme() -> None:

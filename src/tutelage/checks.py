@@ -312,6 +312,7 @@ def check_policy(policy: Policy, fleet: Fleet, *, seed: int = 0) -> None:
         ContractError: naming the broken clause.
     """
     name = type(policy).__name__
+    _demand(isinstance(policy, Policy), f"{name} is no policy; it needs act(obs)")
     obs = _observations(fleet, seed)
     width, scale = len(fleet.action_low), float((fleet.action_high - fleet.action_low).max())
     _check_rowwise(policy.act, f"{name}.act", obs, (width,), scale, seed)
@@ -442,6 +443,7 @@ def check_supervisor(supervisor: Supervisor, fleet: Fleet, *, seed: int = 0) -> 
         ContractError: naming the broken clause.
     """
     name = type(supervisor).__name__
+    _demand(isinstance(supervisor, Supervisor), f"{name} is no supervisor; it needs act(obs, robots)")
     obs = _observations(fleet, seed)
     n, low, high = fleet.num_envs, fleet.action_low, fleet.action_high
     middle, half = (low + high) / 2, (high - low) / 2

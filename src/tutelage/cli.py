@@ -101,7 +101,8 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
         runs: run folders.
         out: where the page goes; default: report.html in the only run, or in the folder that holds them all.
     """
-    from tutelage.experiments.report import load_runs, summary_table, write_report
+    from tutelage.experiments.records import load_runs
+    from tutelage.experiments.report import summary_table, write_report
 
     if not runs:
         raise ConfigError("name at least one run folder, such as: tutelage report runs/*")

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from tutelage.errors import ConfigError, RunFolderError, TutelageError
 from tutelage.experiments.config import RunConfig, from_json, to_json
 from tutelage.fleet.priority import PriorityConfig
-from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
 
 
@@ -66,7 +65,14 @@ def test_reports_name_the_priority_unless_there_is_a_label() -> None:
     bootstrap=st.booleans(),
 )
 def test_a_configuration_comes_back_from_json_as_it_was(
-    robots: int, hidden: tuple[int, ...], noise: float, level: Any, out: Any, uncertainty: Any, schedule: Any, bootstrap: bool
+    robots: int,
+    hidden: tuple[int, ...],
+    noise: float,
+    level: Any,
+    out: Any,
+    uncertainty: Any,
+    schedule: Any,
+    bootstrap: bool,
 ) -> None:
     config = RunConfig(
         "Walker2d", robots=robots, humans=1, hidden=hidden, supervisor_noise=noise, disturbance=level, out=out,
@@ -79,9 +85,6 @@ def test_a_configuration_comes_back_from_json_as_it_was(
 def test_numbers_of_numpy_are_stored_as_numbers() -> None:
     config = RunConfig("Walker2d", robots=np.int64(6), humans=np.int32(2), supervisor_noise=np.float32(0.5))  # type: ignore[arg-type]
     assert from_json(RunConfig, to_json(config)) == config
-
-
-NESTED = {"thresholds": PriorityConfig, "learner": LearnerConfig, "critic": CriticConfig}
 
 
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(RunConfig)])

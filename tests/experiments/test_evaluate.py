@@ -73,7 +73,9 @@ def test_what_cannot_be_evaluated_is_said(folder: Path, arguments: dict[str, Any
 
 def test_a_run_without_a_threshold_of_uncertainty_cannot_be_helped_by_it(tmp_path: Path) -> None:
     run = Run.start(points(tmp_path / "run", priority="C."))
-    with pytest.raises(ConfigError, match="this run has no threshold of uncertainty, which U.C. needs; choose C. or Random."):
+    with pytest.raises(
+        ConfigError, match="this run has no threshold of uncertainty, which U.C. needs; choose C. or Random."
+    ):
         evaluate_run(run.folder, 20, "U.C.")
 
 

@@ -243,7 +243,9 @@ def test_a_database_that_is_full_is_reported(tmp_path: Path) -> None:
 
 def test_a_database_that_is_none_is_reported(tmp_path: Path) -> None:
     (tmp_path / "events.sqlite").write_bytes(b"garbage" * 100)
-    with pytest.raises(RunFolderError, match=r"cannot open .*events.sqlite: file is not a database; restore the file or start"):
+    with pytest.raises(
+        RunFolderError, match=r"cannot open .*events.sqlite: file is not a database; restore the file or start"
+    ):
         EventStore(tmp_path / "events.sqlite")
 
 

@@ -17,7 +17,8 @@ from fakes import FakeLearner, PointFleet, make_loop
 from tutelage.errors import MissingExtraError, RunFolderError
 from tutelage.experiments import plots
 from tutelage.experiments.recording import Recorder
-from tutelage.experiments.report import differences, load_run, load_runs, summary_table, write_report
+from tutelage.experiments.records import load_run, load_runs
+from tutelage.experiments.report import differences, summary_table, write_report
 from tutelage.fleet.events import Events
 from tutelage.fleet.metrics import EventLog, summary
 from tutelage.fleet.modes import Event, Mode
@@ -78,7 +79,7 @@ def run(tmp_path: Path) -> Path:
 def test_what_the_recorder_writes_can_be_read(tmp_path: Path) -> None:
     fleet = PointFleet(5, noise=0.3, goal=0.4, bound=0.6, horizon=6)
     loop = make_loop(fleet, parse("C.Random."), humans=2, learner=FakeLearner())
-    recorder = Recorder(tmp_path, robots=5, humans=2, every=10, frames="none")
+    recorder = Recorder(tmp_path, robots=5, humans=2, steps=60, every=10, frames="none")
     loop.subscribers.append(recorder)
     (tmp_path / "config.json").write_text('{"robots": 5, "humans": 2}')
     loop.run(60)

@@ -124,6 +124,13 @@ def test_relations_do_not_hold_when_the_data_say_so(tmp_path: Path) -> None:
     assert not found["Frozen, C.U.R. approaches the expert (at least 80% of its successes)"].holds
 
 
+def test_a_missing_seed_is_pointed_out(tmp_path: Path) -> None:
+    folder = write(tmp_path, "comparison", "Ant", RATE)
+    assert "The seeds differ" not in tables.tables(folder)
+    next((folder / "comparison" / "Ant").glob("random-s1.json")).unlink()
+    assert "**The seeds differ between algorithms** (Behaviour cloning (C.): 0, 1, 2; Random: 0, 2;" in tables.tables(folder)
+
+
 def test_a_tie_is_no_lead(tmp_path: Path) -> None:
     folder = write(tmp_path, "ablations", "Ant", {"C.U.R.": 80.0, "U.": 80.0})
     assert [r.holds for r in ablation_relations(read(folder, "ablations")["Ant"])] == [False, False]
@@ -165,9 +172,13 @@ def test_without_results_the_page_says_so(tmp_path: Path, docs: Path) -> None:
 
 def test_levels_are_held_against_the_rule(tmp_path: Path) -> None:
     path = tmp_path / "levels.json"
-    fits = {"level": "moderate", "expert_success": 0.94, "bc_success": 0.03, "episodes": 100, "seed": 7}
-    path.write_text(json.dumps({"Walker2d": fits, "Ant": {**fits, "bc_success": 0.2}}))
-    assert "| Walker2d | moderate | 94% | 3% | 100 | yes |\n| Ant | moderate | 94% | 20% | 100 | no |" in levels(path)
+    fits = {"level": "moderate", "expert_success": 0.94, "bc_success": 0.03, "episodes": 100, "offline_pairs": 5000}
+    easy = {**fits, "level": "none", "bc_success": 0.2}
+    path.write_text(json.dumps({"Ant": [easy, {**fits, "chosen": True}], "Walker2d": fits}))
+    walker, ant, chosen = levels(path).splitlines()[2:5]
+    assert walker == "| Walker2d | moderate | 5,000 | 94% | 3% | 100 | yes |"
+    assert ant == "| Ant | none | 5,000 | 94% | 20% | 100 | no |"
+    assert chosen.startswith("| Ant | **moderate** |")
 
 
 @pytest.mark.parametrize("content", ["{", "[]", '{"seed": 1}'])

@@ -40,7 +40,7 @@ class LivePlots:
     def draw(self) -> None:
         """Draw the curves so far, if there are any. A picture that fails must not end a run, nor hide why one ended."""
         from tutelage.experiments import plots
-        from tutelage.experiments.report import load_run
+        from tutelage.experiments.records import load_run
 
         try:
             plots.save(plots.curves([load_run(self._folder)]), self._folder / "plots" / "curves.png")

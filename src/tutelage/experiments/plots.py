@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tutelage.experiments.report import RunRecord
+    from tutelage.experiments.records import RunRecord
 
 Array = NDArray[Any]
 

@@ -133,7 +133,7 @@ def configurations(study: StudyConfig, human_time: float | None) -> dict[str, Ru
 def one(config: RunConfig, evaluate: int, expert: bool) -> dict[str, Any]:
     """Run or continue one configuration, evaluate it, and return the small result. Runs in a process of its own."""
     from tutelage.experiments.evaluate import evaluate_run
-    from tutelage.experiments.report import load_run
+    from tutelage.experiments.records import load_run
     from tutelage.experiments.run import Run
 
     folder = config.folder

@@ -404,8 +404,10 @@ def figure_name(task: str, kind: str) -> str:
 
 NOTE = """Mean ± one standard deviation over seeds (of the seeds themselves, divided by n, as in the dissertation); bold is \
 the best mean of a column, which alone does not make it significant. Times are timesteps; idle time is summed over robots, \
-human time over humans. ROHE is equation 5.2 with human time in hundreds of timesteps. Behaviour cloning was given as many \
-more offline pairs as C.U.R. solicited human timesteps on average; they do not count as its human time.
+human time over humans. ROHE is equation 5.2 with human time in hundreds of timesteps.
+"""
+MORE_DATA = """Behaviour cloning was given as many more offline pairs as C.U.R. solicited human timesteps on average; they \
+do not count as its human time.
 """
 DIFFERS = """The published numbers are from another simulator: Isaac Gym's Humanoid, 108 observations, 21 actions, no \
 disturbances. Ours is Gymnasium's Humanoid-v5 on MuJoCo, 348 observations, 17 actions, with disturbances. Compare the order \
@@ -418,7 +420,7 @@ def tables(results: Path) -> str:
     comparison, ablations = read(results, "comparison"), read(results, "ablations")
     if not comparison and not ablations:
         return f"No results are in `{results.as_posix()}` yet.\n"
-    return "\n".join(_sections(comparison, ablations))
+    return "\n".join(section for section in _sections(comparison, ablations) if section)
 
 
 def _sections(comparison: dict[str, Groups], ablations: dict[str, Groups]) -> Iterator[str]:
@@ -427,14 +429,18 @@ def _sections(comparison: dict[str, Groups], ablations: dict[str, Groups]) -> It
         task: relations(comparison.get(task, {})) + ablation_relations(ablations.get(task, {}))
         for task in sorted(tasks, key=lambda name: _position(name, TASKS))
     }
-    yield f"### Does it reproduce?\n\n{overview(found)}"
+    if any(found.values()):
+        yield f"### Does it reproduce?\n\n{overview(found)}"
     yield NOTE
+    if any("C. (BC)" in groups for groups in comparison.values()):
+        yield MORE_DATA
     for task in found:
         if task in comparison:
             groups = comparison[task]
             yield f"### {task}\n\n{setting(groups)}\n"
             picture = figure_name(task, "comparison")
             yield f"![{task}: successes, ROHE, hard resets and idle time over time](images/{picture})\n"
+            yield _incomplete(groups)
             yield f"While learning, after T timesteps:\n\n{online_table(groups)}"
             frozen = frozen_table(groups, task)
             if frozen:
@@ -447,6 +453,7 @@ def _sections(comparison: dict[str, Groups], ablations: dict[str, Groups]) -> It
             groups = ablations[task]
             yield f"### {task}: ablations of C.U.R.\n\n{setting(groups)}\n"
             yield f"![{task}: ablations of C.U.R. over time](images/{figure_name(task, 'ablations')})\n"
+            yield _incomplete(groups)
             yield online_table(groups)
             frozen = frozen_table(groups, "")
             if frozen:
@@ -454,22 +461,38 @@ def _sections(comparison: dict[str, Groups], ablations: dict[str, Groups]) -> It
             yield details(ablation_relations(groups))
 
 
+def _incomplete(groups: Groups) -> str:
+    """A warning where algorithms were not run with the same seeds."""
+    seeds = {group.title: group.seeds for group in groups.values()}
+    if len(set(seeds.values())) == 1:
+        return ""
+    listed = "; ".join(f"{title}: {', '.join(map(str, numbers))}" for title, numbers in seeds.items())
+    return f"**The seeds differ between algorithms** ({listed}).\n"
+
+
 def levels(path: Path) -> str:
     """What stands between the markers of "How the levels were fixed" in docs/tasks.md."""
     if not path.exists():
         return f"`{path.as_posix()}` has not been written yet.\n"
     try:
-        found: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-        rows = []
-        for task in sorted(found, key=lambda name: _position(name, TASKS)):
-            level = found[task]
-            expert, cloned = float(level["expert_success"]), float(level["bc_success"])
-            fits = "yes" if expert > RULE[0] and cloned < RULE[1] else "no"
-            rows.append([task, str(level["level"]), f"{expert:.0%}", f"{cloned:.0%}", f"{level['episodes']}", fits])
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        rows = [
+            _level(task, level)
+            for task in sorted(found, key=lambda name: _position(name, TASKS))
+            for level in (found[task] if isinstance(found[task], list) else [found[task]])
+        ]
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise RunFolderError(f"{path} is damaged: {error!r}") from None
-    head = ["Task", "Level", "Expert succeeds", "Behaviour cloning succeeds", "Episodes", "Fits the rule"]
-    return markdown(head, rows)
+    head = ["Task", "Level", "Offline pairs", "Expert succeeds", "Behaviour cloning succeeds", "Episodes", "Fits the rule"]
+    return markdown(head, rows) + "\nBold: the level of the task, where others were measured too.\n"
+
+
+def _level(task: str, level: dict[str, Any]) -> list[str]:
+    expert, cloned = float(level["expert_success"]), float(level["bc_success"])
+    fits = "yes" if expert > RULE[0] and cloned < RULE[1] else "no"
+    name = f"**{level['level']}**" if level.get("chosen") else str(level["level"])
+    pairs = f"{level['offline_pairs']:,}" if "offline_pairs" in level else ""
+    return [task, name, pairs, f"{expert:.0%}", f"{cloned:.0%}", str(level["episodes"]), fits]
 
 
 def insert(page: str, name: str, content: str) -> str:
