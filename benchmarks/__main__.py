@@ -24,7 +24,9 @@ def main() -> None:
         parser.error(f"unknown benchmark {', '.join(sorted(unknown))}; known: {', '.join(NAMES)}")
     for name in given.names or NAMES:
         where = machine()
-        print(f"\n{name}, on {where['cores']} cores of {where['processor']}, load {where['load_average_before']}\n", flush=True)
+        print(
+            f"\n{name}, on {where['cores']} cores of {where['processor']}, load {where['load_average_before']}\n", flush=True
+        )
         result = importlib.import_module(f"benchmarks.{name}").run(quick=given.quick)
         given.out.mkdir(parents=True, exist_ok=True)
         path = given.out / f"{name}.json"

@@ -1,4 +1,4 @@
-"""The parts that the benchmarks share: a fleet with humans that is ready to run, without training an expert first."""
+"""What the benchmarks share: a fleet with humans that is ready to run after seconds."""
 
 from __future__ import annotations
 
@@ -7,29 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from tutelage.envs import experts
-from tutelage.envs.tasks import TASKS
 from tutelage.experiments.assemble import Assembly, assemble
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.priority import PriorityConfig
-from tutelage.learning.critic import CriticConfig
-from tutelage.policies.expert import GaussianActor
 
 ROBOTS, HUMANS = 100, 10
 OFFLINE = 5000
 """State-action pairs before the run (the dissertation's number)."""
 
 
-def ready(task: str, seed: int = 0, pretrain: int = 100, capacity: int = 50_000, **settings: Any) -> Assembly:
+def ready(task: str, seed: int = 0, pretrain: int = 100, **settings: Any) -> Assembly:
     """100 robots, 10 humans, C.U.R., in a calm world; cloned for a while, so that the thresholds mean something.
 
     `t_I` is 0: fallen robots are reset from the start, as they are during most of a run.
     """
     config = RunConfig(
-        task=f"{TASKS[task].__module__}:{TASKS[task].__name__}",  # as "module:class": no success return from a card
-        expert=f"benchmarks.fleets:{task.lower()}_supervisor",
-        robots=ROBOTS, humans=HUMANS, seed=seed, disturbance="none",
-        thresholds=PriorityConfig(initial=0), critic=CriticConfig(capacity=capacity), **settings,
+        task=task, robots=ROBOTS, humans=HUMANS, seed=seed, disturbance="none",
+        thresholds=PriorityConfig(initial=0), **settings,
     )  # fmt: skip
     assembly = assemble(config)
     fleet, learner, policy = assembly.fleet, assembly.learner, assembly.policy
@@ -52,14 +46,3 @@ def ready(task: str, seed: int = 0, pretrain: int = 100, capacity: int = 50_000,
     risk = np.concatenate([learner.critics["risk"](o, a) for o, a in zip(seen, done, strict=True)])
     found = PriorityConfig(float(np.quantile(uncertainty, 0.9)), float(np.quantile(risk, 0.99)), initial=0)
     return dataclasses.replace(assembly, config=dataclasses.replace(assembly.config, thresholds=found))
-
-
-def walker2d_supervisor() -> GaussianActor:
-    """The shipped expert."""
-    return experts.load("Walker2d")[0]
-
-
-def humanoid_supervisor() -> GaussianActor:
-    """A controller of the usual size that has learned nothing: as fast as an expert, and its robots fall."""
-    task = TASKS["Humanoid"]
-    return GaussianActor(task.expert_features, np.full(17, -0.4), np.full(17, 0.4), (256, 128))  # type: ignore[arg-type]

@@ -116,7 +116,9 @@ class RiskCritic:
         return buffer[np.random.randint(min(self.count[kind], len(buffer)), size=n)]  # noqa: NPY002
 
     def inputs(self, obs: np.ndarray, action: np.ndarray) -> torch.Tensor:
-        return torch.cat([self.policy.normalise(obs), torch.as_tensor(action / self.policy.half, dtype=torch.float32)], dim=1)
+        return torch.cat(
+            [self.policy.normalise(obs), torch.as_tensor(action / self.policy.half, dtype=torch.float32)], dim=1
+        )
 
     def risk(self, obs: np.ndarray, action: np.ndarray) -> np.ndarray:
         with torch.no_grad():
@@ -125,7 +127,9 @@ class RiskCritic:
 
     def update(self) -> None:
         positives = round(self.c.positives * self.c.batch) if self.count[True] else 0
-        batch = np.concatenate([self.draw(False, self.c.batch - positives), *([self.draw(True, positives)] if positives else [])])
+        batch = np.concatenate(
+            [self.draw(False, self.c.batch - positives), *([self.draw(True, positives)] if positives else [])]
+        )
         obs, action, next_obs, event = np.split(batch, self.cuts, axis=1)
         with torch.no_grad():
             after = self.inputs(next_obs, self.policy.act(next_obs))

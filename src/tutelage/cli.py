@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import io
+import itertools
+import re
 import signal
 import sys
-from collections.abc import Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -222,7 +226,7 @@ def _go(prepared: Run, tensorboard: bool) -> None:
     console.print(f"run folder: {prepared.folder}   plots: {prepared.folder / 'plots'}", highlight=False, soft_wrap=True)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _interruptible(loop: Loop) -> Iterator[None]:
     """The first Ctrl-C asks the loop to stop, the second one insists."""
 
@@ -272,12 +276,41 @@ def main(args: Sequence[str] | None = None) -> None:
         print(f"tutelage {__version__}")
         return
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            verbs, prog="tutelage", args=arguments, description="Supervised autonomy for robot fleets."
-        )
+        _parse(verbs, arguments)()
     except TutelageError as error:
         print(f"tutelage: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("tutelage: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Callable[[], None]:
+    """The call that the arguments ask for. The parser's boxes become one line, like every other error."""
+
+    def later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+        @functools.wraps(verb)
+        def call(*args: Any, **kwargs: Any) -> Callable[[], None]:
+            return functools.partial(verb, *args, **kwargs)
+
+        return call
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
+                {name: later(verb) for name, verb in verbs.items()},
+                prog="tutelage",
+                args=arguments,
+                description="Supervised autonomy for robot fleets.",
+            )
+        return chosen
+    except SystemExit as stop:
+        if stop.code != 2:
+            raise
+    lines = [line.strip("│╭╮╰╯ ").strip() for line in said.getvalue().splitlines()[1:]]
+    problem = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines)).strip().rstrip(".")
+    meant = re.search(r"Perhaps you meant:\s+(-\S+)", " ".join(lines))
+    hint = f"; did you mean {meant[1]}?" if meant else ""
+    verb = f" {arguments[0]}" if arguments and arguments[0] in verbs else ""
+    raise ConfigError(f"{problem}{hint} (see tutelage{verb} --help)")

@@ -7,9 +7,8 @@ calls a thread, whatever the number of robots. Results do not depend on the numb
 from __future__ import annotations
 
 import copy
-import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,11 @@ try:
     import mujoco
     import numba
     from numba import types
+    from numba.extending import intrinsic
 except ImportError as error:  # pragma: no cover - exercised in an environment without the extra
     raise MissingExtraError(error.name or "mujoco", "mujoco") from error
 
 Array = NDArray[Any]
-
-_CHUNK = 4  # robots a thread claims at a time: small enough to balance falls and contacts, large enough to be cheap
 
 
 def _load_library() -> None:
@@ -50,6 +48,18 @@ _mj_contact_forces = types.ExternalFunction("mj_rnePostConstraint", types.void(_
 _memmove = types.ExternalFunction("memmove", _P(_P, _P, types.uintp))
 
 
+@intrinsic
+def _claim(typing, address):  # type: ignore[no-untyped-def]
+    """The integer at an address, which is one more afterwards, whoever else asks at the same time (an atomic increment)."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        kind = context.get_value_type(types.intp)
+        pointer = builder.inttoptr(arguments[0], kind.as_pointer())
+        return builder.atomic_rmw("add", pointer, kind(1), "monotonic")
+
+    return types.intp(types.intp), generate
+
+
 @numba.njit(nogil=True, cache=True)
 def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-untyped-def]
     """Copy robot i's fields, one behind the other, into row i of the frame (float64)."""
@@ -61,10 +71,14 @@ def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-u
 
 @numba.njit(nogil=True, cache=True)
 def _advance(  # type: ignore[no-untyped-def]
-    robots, models, datas, substeps, forces,
+    robots, next_one, models, datas, substeps, forces,
     ctrl_at, ctrl_address, ctrl_width, push_at, push_address, sources, sizes, frame_address, frame_width,
 ):  # fmt: skip
-    for i in robots:
+    while True:
+        claimed = _claim(next_one)
+        if claimed >= len(robots):
+            return
+        i = robots[claimed]
         _memmove(ctrl_at[i], ctrl_address + i * ctrl_width * 8, ctrl_width * 8)
         _memmove(push_at[i], push_address + i * 48, 48)
         for _ in range(substeps):
@@ -76,9 +90,14 @@ def _advance(  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def _restart(  # type: ignore[no-untyped-def]
-    robots, models, datas, qpos_at, qpos_address, nq, qvel_at, qvel_address, nv, sources, sizes, frame_address, frame_width
+    robots, next_one, models, datas,
+    qpos_at, qpos_address, nq, qvel_at, qvel_address, nv, sources, sizes, frame_address, frame_width,
 ):  # fmt: skip
-    for i in robots:
+    while True:
+        claimed = _claim(next_one)
+        if claimed >= len(robots):
+            return
+        i = robots[claimed]
         _mj_reset(models[i], datas[i])
         _memmove(qpos_at[i], qpos_address + i * nq * 8, nq * 8)
         _memmove(qvel_at[i], qvel_address + i * nv * 8, nv * 8)
@@ -194,14 +213,14 @@ class Physics:
 
     def _spread(self, kernel: Any, robots: Array, *arguments: Any) -> list[Future[None]]:
         robots = np.ascontiguousarray(robots, dtype=np.intp)
-        counter = itertools.count(0, _CHUNK)
+        # The threads claim robots one by one from a common counter, in compiled code: falls and contacts take longer, and
+        # none of them waits for the interpreter lock while training holds it.
+        counter = np.zeros(1, dtype=np.intp)
 
-        def work(counter: Iterator[int]) -> None:
-            while (start := next(counter)) < len(robots):
-                kernel(robots[start : start + _CHUNK], *arguments)
+        def work() -> None:
+            kernel(robots, _address(counter), *arguments)
 
-        workers = min(self.threads, -(-len(robots) // _CHUNK))
-        return [self._pool.submit(work, counter) for _ in range(workers)]
+        return [self._pool.submit(work) for _ in range(min(self.threads, len(robots)))]
 
     def get_state(self) -> Array:
         """Full integration state of every robot, (N, S) float64: what is needed to continue bit for bit."""

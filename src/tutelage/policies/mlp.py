@@ -47,5 +47,5 @@ class BatchedMLP(nn.Module):
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = torch.baddbmm(bias, x, weight)
             if k < depth - 1:
-                x = x.relu()
+                x = x.relu_()  # in place: the sum before it is not needed for gradients
         return self.last(x) if self.last else x
