@@ -15,25 +15,29 @@ SIZES = ((1_000_000, 10_000), (100, 10))
 
 def run(quick: bool = False) -> dict[str, Any]:
     """Milliseconds of one allocation, by kind of priorities; half of the humans are busy with a robot."""
-    rows, results = [], []
-    for robots, humans in SIZES:
-        repeats = 1 if robots > 10_000 else 200
-        rng = np.random.Generator(np.random.PCG64(0))
-        previous, mode, age = _assigned(robots, humans, rng)
-        numbers, allocate = rng.random(robots), FleetDAgger()
-        variants = {"np.partition": lambda: [np.partition(numbers, robots - humans) for _ in range(repeats)]}
-        for kind, ranks in _priorities(robots, rng).items():
-            variants[kind] = lambda ranks=ranks: [allocate(ranks, previous, mode, age, rng) for _ in range(repeats)]
-        for work in variants.values():
-            work()
-        seconds = take_turns(variants, rounds=7 if quick else 31)
-        for kind in variants:
-            took = 1e3 * float(np.median(seconds[kind])) / repeats
-            against = ratio(seconds, kind, "np.partition")
-            rows.append([f"{robots:,} x {humans:,}", kind, took, against])
-            results.append({"robots": robots, "humans": humans, "ranks": kind, "milliseconds": took, "ratio": against})
-    print(table(["robots x humans", "priorities", "ms", "/ np.partition"], rows))
+    results = [result for size in SIZES for result in measure(*size, rounds=7 if quick else 31)]
+    rows = [[f"{r['robots']:,} x {r['humans']:,}: {r['ranks']}", r["milliseconds"], r["ratio"]] for r in results]
+    print(table(["robots x humans: priorities", "ms", "/ np.partition"], rows))
     return {"allocation": results}
+
+
+def measure(robots: int, humans: int, rounds: int) -> list[dict[str, Any]]:
+    """One size of fleet."""
+    repeats = 1 if robots > 10_000 else 200
+    rng = np.random.Generator(np.random.PCG64(0))
+    previous, mode, age = _assigned(robots, humans, rng)
+    numbers, allocate = rng.random(robots), FleetDAgger()
+    variants = {"np.partition": lambda: [np.partition(numbers, robots - humans) for _ in range(repeats)]}
+    for kind, ranks in _priorities(robots, rng).items():
+        variants[kind] = lambda ranks=ranks: [allocate(ranks, previous, mode, age, rng) for _ in range(repeats)]
+    for work in variants.values():
+        work()
+    seconds = take_turns(variants, rounds)
+    return [
+        {"robots": robots, "humans": humans, "ranks": kind, "milliseconds": 1e3 * float(np.median(took)) / repeats,
+         "ratio": ratio(seconds, kind, "np.partition")}
+        for kind, took in seconds.items()
+    ]  # fmt: skip
 
 
 def _assigned(robots: int, humans: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,18 +16,19 @@ from tutelage.envs.engine import wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.tasks import TASKS
 
-SIZES, THREADS = (1, 100, 1000), (1, 2, 4)
+STEPS, THREADS = {1: 50, 100: 20, 1000: 5}, (1, 2, 4)
+"""Timesteps of a round, by number of robots."""
 SCALE = 0.3
 """Actions are uniform within this fraction of their bounds, the same for all variants."""
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """Each number is a median over rounds in which all variants of a size take turns; robots that fall are reset."""
+    """Each number is a median over rounds in which all variants take turns; all robots stand upright at their start."""
     results = []
-    for robots in SIZES:
+    for robots in STEPS:
         rows = []
         for task in TASKS:
-            rates = measure(task, robots, rounds=3 if quick else 5)
+            rates = measure(task, robots, rounds=3 if quick else 7)
             rows.append([task, *rates.values()])
             results.append({"task": task, "robots": robots, "steps a second": rates})
         print(table([f"{robots} robots", *rates], rows), "\n", flush=True)
@@ -36,25 +37,29 @@ def run(quick: bool = False) -> dict[str, Any]:
 
 def measure(task: str, robots: int, rounds: int) -> dict[str, float]:
     """Robot steps a second of each variant."""
-    steps = max(1, 200 // robots) if robots > 1 else 100
+    steps = STEPS[robots]
     rng = np.random.Generator(np.random.PCG64(0))
     variants: dict[str, Callable[[], Any]] = {}
+    upright: dict[str, Callable[[], Any]] = {}
     fleets = [MujocoFleet(task, robots, disturbance="none", threads=n) for n in THREADS if n == 1 or robots > 1]
     low, high = fleets[0].action_low, fleets[0].action_high
     actions = SCALE * rng.uniform(low, high, (steps, robots, len(low)))
     for fleet in fleets:
         fleet.reset(seed=0)
-        threads = fleet.physics.threads
-        variants[f"ours, {threads} thr."] = lambda fleet=fleet: _fleet(fleet, actions)
-        if fleet is fleets[-1]:
-            variants[f"raw physics, {threads} thr."] = lambda fleet=fleet: _physics(fleet, actions)
-            variants[f"mujoco.rollout, {threads} thr."] = _rollout(fleet, actions)
+        name = f"ours, {fleet.physics.threads} thr."
+        variants[name] = lambda fleet=fleet: _fleet(fleet, actions)
+        upright[name] = fleet.reset
+    largest, threads = fleets[-1], fleets[-1].physics.threads
+    variants[f"raw physics, {threads} thr."] = lambda: _physics(largest, actions)
+    upright[f"raw physics, {threads} thr."] = largest.reset
+    variants[f"mujoco.rollout, {threads} thr."] = _rollout(largest, actions)
     envs = SyncVectorEnv([lambda: gym.make(f"{task}-v5") for _ in range(robots)])
     envs.reset(seed=0)
+    upright["SyncVectorEnv"] = envs.reset
     variants["SyncVectorEnv"] = lambda: [envs.step(a.astype(np.float32)) for a in actions]
     for work in variants.values():
         work()
-    seconds = take_turns(variants, rounds)
+    seconds = take_turns(variants, rounds, before=upright)
     envs.close()
     for fleet in fleets:
         fleet.close()

@@ -13,7 +13,7 @@ from benchmarks.fleets import OFFLINE, ready
 from benchmarks.original_loop import OriginalLoop
 from benchmarks.timing import Phases, ratio, table, take_turns
 from tutelage.envs import mujoco_fleet
-from tutelage.envs.engine import Physics, wait
+from tutelage.envs.engine import wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.experiments.assemble import Assembly
 from tutelage.fleet.loop import Loop

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import io
 import itertools
+import os
 import re
 import signal
 import sys
@@ -275,14 +276,20 @@ def main(args: Sequence[str] | None = None) -> None:
     if arguments == ["--version"]:
         print(f"tutelage {__version__}")
         return
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # so that module:callable finds a file of the user's in the present folder
     try:
         _parse(verbs, arguments)()
+        sys.stdout.flush()
     except TutelageError as error:
         print(f"tutelage: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("tutelage: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+    except BrokenPipeError:  # the reader of our output, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
 
 
 def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Callable[[], None]:

@@ -1,6 +1,6 @@
 """Disturbances: what makes the real world harder than the nominal model. Part of a task, seeded, at a named level.
 
-Without them the Gymnasium locomotion tasks are too easy for imitation: a handful of demonstrations already succeed.
+They decide whether help is needed at all: see `tutelage.experiments.levels`.
 """
 
 from __future__ import annotations

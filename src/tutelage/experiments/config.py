@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from tutelage.errors import ConfigError, RunFolderError
 from tutelage.fleet.priority import PriorityConfig
@@ -62,7 +62,7 @@ class RunConfig:
         label: name of the algorithm in reports; default: the priority.
     """
 
-    task: Positional[str]
+    task: Annotated[Positional[str], arg(metavar="TASK")]
     priority: str = "C.U.R."
     robots: int = 100
     humans: int = 10

@@ -8,9 +8,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
@@ -37,7 +38,7 @@ class ExpertConfig:
         ppo: hyper-parameters.
     """
 
-    task: Positional[str]
+    task: Annotated[Positional[str], arg(metavar="TASK")]
     steps: int = 5_000_000
     robots: int = 64
     disturbance: str | None = None

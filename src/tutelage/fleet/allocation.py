@@ -48,9 +48,8 @@ class FleetDAgger:
         (free,) = np.nonzero(robots == NOBODY)
         wanted = highest(ranks, len(free), exclude=robots[robots != NOBODY], rng=rng)
 
-        stays = free[
-            np.isin(previous[free], wanted, kind="table")
-        ]  # lines 7-10 fell through, yet the robot is still among the best
+        # Lines 7-10 fell through, yet the robot is still among the best.
+        stays = free[np.isin(previous[free], wanted, kind="table")]
         robots[stays] = previous[stays]
         others = wanted[~np.isin(wanted, robots[stays], kind="table")]
         movers = free[~np.isin(free, stays, kind="table")][: len(others)]  # lines 15-17
