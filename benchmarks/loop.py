@@ -134,7 +134,7 @@ def run(quick: bool = False) -> dict[str, Any]:
     """Both tasks: milliseconds a timestep, the ratios, and where the rest of the time goes."""
     rows, where, results = [], [], []
     for task in ("Walker2d", "Humanoid"):
-        result = measure(task, steps=20 if quick else 40, rounds=3 if quick else 9)
+        result = measure(task, steps=20 if quick else 30, rounds=3 if quick else 7)
         ms, ratios = result["milliseconds"], result["ratios"]
         rows.append([task, *(ms[name] for name in VARIANTS), *ratios.values()])
         where += [[task, phase, took] for phase, took in result["phases"].items()]

@@ -21,8 +21,7 @@ from tyro.conf import Positional, arg
 
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
-from tutelage.experiments.config import RunConfig
-from tutelage.experiments.train_expert import ExpertConfig
+from tutelage.experiments.config import ExpertConfig, RunConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

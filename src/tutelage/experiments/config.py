@@ -1,4 +1,4 @@
-"""One configuration of the loop, as plain data: the flags of `tutelage run`, and `config.json` of its folder."""
+"""Configurations as plain data: the flags of `tutelage run` and `train-expert`, and `config.json` of a run folder."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tutelage.errors import ConfigError, RunFolderError
 from tutelage.fleet.priority import PriorityConfig
 from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
+from tutelage.learning.ppo import PPOConfig
 
 FORMAT = 1
 """Version of a run folder. A folder of another version is refused, never guessed at."""
@@ -123,6 +124,40 @@ class RunConfig:
     def algorithm(self) -> str:
         """Name in reports."""
         return self.label or self.priority
+
+
+@dataclass(frozen=True)
+class ExpertConfig:
+    """Training of an algorithmic supervisor.
+
+    Attributes:
+        task: name of a MuJoCo task.
+        steps: environment steps in total, over all robots.
+        robots: robots in the fleet that collects experience.
+        disturbance: level during training; default: the task's own.
+        seed: root seed.
+        out: folder of checkpoints and weights; default: runs/expert-TASK. If it holds a checkpoint, training goes on.
+        evaluate_every: environment steps between evaluations; the best policy so far is kept.
+        threads: physics threads; default: all cores.
+        torch_threads: threads of matrix products.
+        ppo: hyper-parameters.
+    """
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    steps: int = 5_000_000
+    robots: int = 64
+    disturbance: str | None = None
+    seed: int = 0
+    out: Path | None = None
+    evaluate_every: int = 500_000
+    threads: int | None = None
+    torch_threads: int = 2
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "robots", "evaluate_every", "torch_threads"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 def to_json(config: Any) -> dict[str, Any]:

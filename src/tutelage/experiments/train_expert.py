@@ -6,53 +6,16 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import torch
-from tyro.conf import Positional, arg
 
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
-from tutelage.errors import ConfigError
-from tutelage.learning.ppo import PPO, PPOConfig
+from tutelage.experiments.config import ExpertConfig
+from tutelage.learning.ppo import PPO
 from tutelage.policies.expert import GaussianActor
 from tutelage.store import load_tree
-
-
-@dataclass(frozen=True)
-class ExpertConfig:
-    """Training of an algorithmic supervisor.
-
-    Attributes:
-        task: name of a MuJoCo task.
-        steps: environment steps in total, over all robots.
-        robots: robots in the fleet that collects experience.
-        disturbance: level during training; default: the task's own.
-        seed: root seed.
-        out: folder of checkpoints and weights; default: runs/expert-TASK. If it holds a checkpoint, training goes on.
-        evaluate_every: environment steps between evaluations; the best policy so far is kept.
-        threads: physics threads; default: all cores.
-        torch_threads: threads of matrix products.
-        ppo: hyper-parameters.
-    """
-
-    task: Annotated[Positional[str], arg(metavar="TASK")]
-    steps: int = 5_000_000
-    robots: int = 64
-    disturbance: str | None = None
-    seed: int = 0
-    out: Path | None = None
-    evaluate_every: int = 500_000
-    threads: int | None = None
-    torch_threads: int = 2
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "robots", "evaluate_every", "torch_threads"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 def train(config: ExpertConfig, say: Callable[[str], None] = print) -> Path:

@@ -15,7 +15,7 @@ class Humanoid(MujocoTask):
     fields = ("qpos", "qvel", "cinert", "cvel", "qfrc_actuator", "cfrc_ext", "xipos", "ctrl")
     contact_forces = True
     expert_features = 45
-    disturbance = "light"
+    disturbance = "moderate"
     initial_period = 1000
     summary = "a humanoid walks forward; violation: torso below 1 m or above 2 m"
 
