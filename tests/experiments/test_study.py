@@ -14,7 +14,7 @@ import pytest
 from fakes import PointFleet, make_loop
 from small import points
 
-from tutelage.errors import TutelageError
+from tutelage.errors import RunFolderError, TutelageError
 from tutelage.experiments import study as studies
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.evaluate import evaluate_run
@@ -238,6 +238,31 @@ def test_a_failed_reference_ends_the_study_in_one_line(
     assert "Walker2d C.U.R. seed 0 FAILED" in out
     assert "ZeroDivisionError" in out
     assert not tiny.results.exists()
+
+
+def test_a_failed_run_is_named_and_the_study_fails_after_the_others(
+    tiny: StudyConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = studies.one
+
+    def sometimes(config: RunConfig, *args: Any) -> Any:
+        if (config.algorithm, config.seed) == ("Random", 1):
+            raise ZeroDivisionError
+        return one(config, *args)
+
+    monkeypatch.setattr(studies, "one", sometimes)
+    with pytest.raises(TutelageError, match="1 runs failed"):
+        run_study(tiny)
+    assert "Walker2d Random seed 1 FAILED" in capsys.readouterr().out
+    assert len(files(tiny.results)) == 7
+
+
+def test_a_run_with_other_settings_is_refused_and_an_evaluation_of_other_length_is_made_again(tiny: StudyConfig) -> None:
+    config = dataclasses.replace(studies.configurations(tiny, None)["C.U.R."], out=tiny.out / "run", seed=3)
+    assert studies.one(config, 20, False)["evaluation"]["t"] == 20
+    assert studies.one(config, 15, False)["evaluation"]["t"] == 15
+    with pytest.raises(RunFolderError, match="was run with humans 2, not 1; delete it to run it again"):
+        studies.one(dataclasses.replace(config, humans=1), 20, False)
 
 
 def test_the_command_line_of_a_study(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

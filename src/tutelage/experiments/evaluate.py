@@ -77,6 +77,10 @@ def evaluate_run(
     policy = None if expert else EnsemblePolicy.load(folder / "policy.safetensors")[0]
     metrics = evaluate_policy(config, policy, priority, tally, subscribers)
     result = {"steps": steps, "priority": priority, "policy": "expert" if expert else "run", **metrics}
-    name = "evaluation-expert.json" if expert else "evaluation.json"
-    write_atomic(folder / name, json.dumps(result, indent=2).encode())
+    write_atomic(evaluation_path(folder, expert), json.dumps(result, indent=2).encode())
     return result
+
+
+def evaluation_path(folder: Path, expert: bool) -> Path:
+    """Where the evaluation of a run's policy, or of the expert, is kept."""
+    return folder / ("evaluation-expert.json" if expert else "evaluation.json")

@@ -26,7 +26,7 @@ import tyro
 from tyro.conf import Positional
 
 from tutelage.envs.tasks import TASKS
-from tutelage.errors import TutelageError
+from tutelage.errors import RunFolderError, TutelageError
 from tutelage.experiments.config import RunConfig, to_json
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
 from tutelage.fleet.modes import Mode
@@ -132,21 +132,19 @@ def configurations(study: StudyConfig, human_time: float | None) -> dict[str, Ru
 
 def one(config: RunConfig, evaluate: int, expert: bool) -> dict[str, Any]:
     """Run or continue one configuration, evaluate it, and return the small result. Runs in a process of its own."""
-    from tutelage.experiments.evaluate import evaluate_run
     from tutelage.experiments.records import load_run
     from tutelage.experiments.run import Run
 
     folder = config.folder
     run = Run.resume(folder) if (folder / "config.json").exists() else Run.start(config)
+    _check_same(to_json(config), to_json(run.config), folder)
     metrics = run.run()
     resolved = to_json(run.config)
     result: dict[str, Any] = {"algorithm": config.algorithm, "seed": config.seed, "metrics": metrics}
     if evaluate:
-        path = folder / "evaluation.json"
-        result["evaluation"] = json.loads(path.read_text()) if path.exists() else evaluate_run(folder, evaluate)
+        result["evaluation"] = _evaluation(folder, evaluate, expert=False)
     if evaluate and expert:
-        path = folder / "evaluation-expert.json"
-        result["expert"] = json.loads(path.read_text()) if path.exists() else evaluate_run(folder, evaluate, expert=True)
+        result["expert"] = _evaluation(folder, evaluate, expert=True)
     record = load_run(folder)
     lines = record.metrics
     pick = np.unique(np.linspace(0, len(lines["t"]) - 1, 50).round().astype(int))
@@ -158,8 +156,32 @@ def one(config: RunConfig, evaluate: int, expert: bool) -> dict[str, Any]:
     return result
 
 
+def _evaluation(folder: Path, steps: int, expert: bool) -> dict[str, Any]:
+    """The evaluation of a run over so many timesteps: the one that is there, or a new one."""
+    from tutelage.experiments.evaluate import evaluate_run, evaluation_path
+
+    path = evaluation_path(folder, expert)
+    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    return found if found.get("steps") == steps else evaluate_run(folder, steps, expert=expert)
+
+
+def _check_same(wanted: dict[str, Any], found: dict[str, Any], folder: Path) -> None:
+    """Refuse a run of the same name with other settings; what is None in `wanted` is for the run to resolve."""
+    for name, value in wanted.items():
+        if isinstance(value, dict):
+            _check_same(value, found[name], folder)
+        elif value is not None and value != found[name]:
+            raise RunFolderError(
+                f"{folder} was run with {name} {found[name]}, not {value}; delete it to run it again, or choose --out"
+            )
+
+
 def run_study(study: StudyConfig) -> list[dict[str, Any]]:
-    """Run what is missing; returns the small results of all runs, also written one file each."""
+    """Run what is missing; returns the small results of all runs, also written one file each.
+
+    Raises:
+        TutelageError: a run failed. It was printed with its traceback, and the others were still run and written.
+    """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(study.workers, mp_context=context) as pool:
         reference = _run_all(pool, study, configurations(study, None))
@@ -167,7 +189,12 @@ def run_study(study: StudyConfig) -> list[dict[str, Any]]:
             raise TutelageError("a run of C.U.R. failed, and its human time sets the others; mend it, then start again")
         human_time = float(np.mean([r["metrics"]["human_time"] for r in reference]))
         print(f"C.U.R. solicited {human_time:,.0f} human timesteps on average", flush=True)
-        return reference + _run_all(pool, study, configurations(study, human_time))
+        others = configurations(study, human_time)
+        results = _run_all(pool, study, others)
+    failed = len(others) * len(study.seeds) - len(results)
+    if failed:
+        raise TutelageError(f"{failed} runs failed (see above); mend them, then start again: the others are kept")
+    return reference + results
 
 
 def _run_all(pool: ProcessPoolExecutor, study: StudyConfig, configs: dict[str, RunConfig]) -> list[dict[str, Any]]:
@@ -187,7 +214,7 @@ def _run_all(pool: ProcessPoolExecutor, study: StudyConfig, configs: dict[str, R
         title, file = jobs[job]
         try:
             result = job.result()
-        except Exception:
+        except Exception:  # whatever stopped one run must not stop the others; `run_study` raises in the end
             print(f"{title} FAILED\n{traceback.format_exc()}", flush=True)
             continue
         write_atomic(file, (json.dumps(result, indent=1) + "\n").encode())
