@@ -14,6 +14,8 @@ from small import contents, points, walker
 from tutelage.errors import ConfigError, RunFolderError, TutelageError
 from tutelage.experiments.evaluate import evaluate_policy, evaluate_run
 from tutelage.experiments.run import Run
+from tutelage.fleet.priority import PriorityConfig
+from tutelage.policies.expert import GaussianActor
 
 pytest.importorskip("mujoco")
 pytest.importorskip("pyarrow")
@@ -45,6 +47,13 @@ def test_the_expert_is_better_and_has_its_own_file(folder: Path) -> None:
     assert expert["policy"] == "expert"
     assert json.loads((folder / "evaluation-expert.json").read_text()) == expert
     assert expert["reward"] > run["reward"]
+
+
+def test_who_falls_is_reset_from_the_start_though_the_run_had_an_initial_period(tmp_path: Path) -> None:
+    config = walker(tmp_path / "run", thresholds=PriorityConfig(uncertainty=0.1, risk=0.5, initial=1000))
+    tired = GaussianActor(17, -np.ones(6), np.ones(6), (8,))  # it does nothing, and falls
+    result = evaluate_policy(dataclasses.replace(config, steps=120), tired)
+    assert result["hard_resets"] > 0
 
 
 def test_help_is_given_when_the_priority_asks_for_it(folder: Path) -> None:

@@ -18,6 +18,7 @@ from fakes import FakePriority as Wants
 from small import contents, points
 
 from tutelage.errors import RunFolderError, TutelageError
+from tutelage.experiments.config import FORMAT
 from tutelage.experiments.recording import EpisodeFrames, EventStore, MetricsFile, Recorder, lock
 from tutelage.experiments.run import Run
 from tutelage.fleet.events import Events
@@ -265,5 +266,5 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
 
 def test_the_checkpoint_holds_no_pickle(tmp_path: Path) -> None:
     run = Run.start(points(tmp_path / "run"))
-    assert load_tree(run.checkpoints.path)["format"] == 1
+    assert load_tree(run.checkpoints.path)["format"] == FORMAT
     assert b"pickle" not in run.checkpoints.path.read_bytes()

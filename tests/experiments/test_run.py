@@ -15,7 +15,7 @@ from tutelage.envs import experts
 from tutelage.errors import ConfigError, ContractError, RunFolderError, TutelageError
 from tutelage.experiments import assemble as assembling
 from tutelage.experiments.assemble import assemble, demonstrations, prepare
-from tutelage.experiments.config import RunConfig, from_json, to_json
+from tutelage.experiments.config import FORMAT, RunConfig, from_json, to_json
 from tutelage.experiments.run import Run, read_config
 from tutelage.fleet.priority import PriorityConfig
 from tutelage.policies.ensemble import EnsemblePolicy
@@ -56,7 +56,7 @@ def test_ten_lines_of_python_are_a_run(tmp_path: Path) -> None:
 def test_the_stored_configuration_is_the_resolved_one(tmp_path: Path) -> None:
     run = Run.start(walker(tmp_path / "run", label="ours"))
     stored = json.loads((run.folder / "config.json").read_text())
-    assert stored["format"] == 1
+    assert stored["format"] == FORMAT
     assert stored["algorithm"] == "ours"
     assert stored["disturbance"] == "moderate"
     assert stored["thresholds"]["initial"] == 250
@@ -323,8 +323,8 @@ FITS_NOT = f"{STATE} does not fit {CONFIG}: one of them is damaged or was change
         ("cut", f"{STATE} is damaged or not a Tutelage file: "),
         ("empty", f"{STATE} is damaged or not a Tutelage file: "),
         ("gone", f"no such file: {STATE}"),
-        ("other", f"{STATE} has format None, this version reads 1; use the version that wrote it"),
-        ("format", f"{STATE} has format 9, this version reads 1; use the version that wrote it"),
+        ("other", f"{STATE} has format None, this version reads 2; use the version that wrote it"),
+        ("format", f"{STATE} has format 9, this version reads 2; use the version that wrote it"),
         ("lacking", FITS_NOT),
         ('{"robots": 7}', FITS_NOT),
         ('{"humans": 3}', FITS_NOT),
@@ -335,7 +335,7 @@ FITS_NOT = f"{STATE} does not fit {CONFIG}: one of them is damaged or was change
         ("list", f"{CONFIG} is damaged"),
         ("deep", f"{CONFIG} is damaged"),
         ("no format", f"{CONFIG} is damaged"),
-        ("old", "{folder} has format 0, this version reads 1; use the version that wrote it"),
+        ("old", "{folder} has format 0, this version reads 2; use the version that wrote it"),
         ('{"robots": "six"}', "a setting has the wrong kind: robots cannot be 'six'"),
         ('{"humans": 9}', "9 humans for 6 robots: use at most one human a robot (M <= N)"),
         ("events", "cannot open {folder}/events.sqlite: file is not a database; restore the file or start a new run"),

@@ -18,7 +18,7 @@ from tutelage.store import load_tree, save_tree
 # -- the ring -------------------------------------------------------------------------------------------------------
 
 
-def rows(first: int, n: int) -> dict[str, np.ndarray]:
+def transitions(first: int, n: int) -> dict[str, np.ndarray]:
     """n transitions that can be told apart."""
     index = np.arange(first, first + n, dtype=float)
     return {
@@ -27,10 +27,16 @@ def rows(first: int, n: int) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
+def rows(first: int, n: int) -> np.ndarray:
+    """The same, one behind the other in each row."""
+    parts = transitions(first, n)
+    return np.column_stack([*parts.values()]).astype(np.float32)
+
+
 def oldest_first(ring: Ring) -> list[float]:
     """What the ring holds, by the first number of obs."""
     index = np.arange(ring.size) if ring.size < ring.capacity else (ring.cursor + np.arange(ring.size)) % ring.capacity
-    return ring.columns["obs"][torch.from_numpy(index), 0].tolist()
+    return ring.rows[torch.from_numpy(index), 0].tolist()
 
 
 @given(
@@ -40,7 +46,7 @@ def oldest_first(ring: Ring) -> list[float]:
 def test_a_ring_is_a_queue_of_limited_length(capacity, parts) -> None:
     ring, model, first = Ring(capacity, 2, 1), deque(maxlen=capacity), 0
     for n, round_trip in parts:
-        ring.add(**rows(first, n))
+        ring.add(rows(first, n))
         model.extend(range(first, first + n))
         first += n
         if round_trip:
@@ -48,24 +54,24 @@ def test_a_ring_is_a_queue_of_limited_length(capacity, parts) -> None:
             ring.load_state_dict(state)
         assert ring.size == len(model)
         assert oldest_first(ring) == list(model)
-        for name, column in ring.columns.items():
-            expected = rows(0, first)[name].astype(np.float32)
-            np.testing.assert_array_equal(column[: ring.size], expected[ring.columns["obs"][: ring.size, 0].long().numpy()])
+        for name, column in ring.columns(ring.rows[: ring.size]).items():
+            expected = transitions(0, first)[name].astype(np.float32)
+            np.testing.assert_array_equal(column, expected[ring.rows[: ring.size, 0].long().numpy()])
 
 
 def test_a_ring_takes_memory_as_it_fills() -> None:
     ring = Ring(100_000, 2, 1)
-    assert len(ring.columns["end"]) == 0
-    ring.add(**rows(0, 10))
-    assert len(ring.columns["end"]) <= 1024
-    ring.add(**rows(10, 5000))
-    assert len(ring.columns["end"]) < 20_000
+    assert len(ring.rows) == 0
+    ring.add(rows(0, 10))
+    assert len(ring.rows) <= 1024
+    ring.add(rows(10, 5000))
+    assert len(ring.rows) < 20_000
 
 
 def test_draws_are_uniform_over_what_is_kept_and_rows_stay_together() -> None:
     ring = Ring(10, 2, 1)
-    ring.add(**rows(0, 25))
-    drawn = ring.draw(20_000, default_rng(0))
+    ring.add(rows(0, 25))
+    drawn = ring.columns(ring.draw(20_000, default_rng(0)))
     index = drawn["obs"][:, 0]
     counts = np.bincount(index.long().numpy(), minlength=25)
     assert (counts[:15] == 0).all()
@@ -77,10 +83,10 @@ def test_draws_are_uniform_over_what_is_kept_and_rows_stay_together() -> None:
 
 def test_the_state_of_a_ring_stays_as_it_was_while_the_ring_goes_round() -> None:
     ring = Ring(5, 2, 1)
-    ring.add(**rows(0, 5))
+    ring.add(rows(0, 5))
     state = ring.state_dict()
-    ring.add(**rows(100, 4))
-    assert state["columns"]["obs"][:, 0].tolist() == [0, 1, 2, 3, 4]
+    ring.add(rows(100, 4))
+    assert state["rows"][:, 0].tolist() == [0, 1, 2, 3, 4]
 
 
 # -- what a critic estimates ----------------------------------------------------------------------------------------

@@ -46,7 +46,8 @@ def step(modes, *, t: int = 0, **masks) -> Step:
 
 def kept(ring) -> dict[str, list]:
     """{obs: end} of the transitions of a critic."""
-    return dict(zip(ring.columns["obs"][: ring.size, 0].tolist(), ring.columns["end"][: ring.size].tolist(), strict=True))
+    now = ring.columns(ring.rows[: ring.size])
+    return dict(zip(now["obs"][:, 0].tolist(), now["end"].tolist(), strict=True))
 
 
 def test_only_teleoperated_robots_become_human_data() -> None:
@@ -62,7 +63,10 @@ def test_critics_see_the_transitions_of_moving_robots_and_no_others() -> None:
     learner.record(step(list(Mode)))
     ring = learner.critics["risk"].plain
     assert kept(ring) == {float(mode): 0.0 for mode in Mode if MOVING[mode]}
-    assert ring.columns["next_obs"][: ring.size, 0].tolist() == [Mode.AUTONOMOUS + 100, Mode.TELEOPERATED + 100]
+    assert ring.columns(ring.rows[: ring.size])["next_obs"][:, 0].tolist() == [
+        Mode.AUTONOMOUS + 100,
+        Mode.TELEOPERATED + 100,
+    ]
     assert learner.critics["risk"].events.size == 0
 
 
@@ -88,13 +92,13 @@ def test_a_critic_sees_the_last_observation_of_an_episode_not_the_first_of_the_n
     for _ in range(80):
         loop.step()
     for ring in (learner.critics["risk"].plain, learner.critics["risk"].events):
-        obs, after = ring.columns["obs"][: ring.size], ring.columns["next_obs"][: ring.size]
+        now = ring.columns(ring.rows[: ring.size])
+        obs, after = now["obs"], now["next_obs"]
         assert ring.size > 10
         assert (obs[:, 2] == after[:, 2]).all()  # the same episode
         assert (obs[:, 1] + 1 == after[:, 1]).all()  # one timestep later
+        assert (now["end"] == float(ring is learner.critics["risk"].events)).all()
     assert (after[:, 0].abs() > 0.5).all()
-    assert (learner.critics["risk"].events.columns["end"][: ring.size] == 1).all()
-    assert (learner.critics["risk"].plain.columns["end"] == 0).all()
 
 
 def changes(learner: ImitationLearner, steps: list[Step], overlap: bool = False) -> list[bool]:

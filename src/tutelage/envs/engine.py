@@ -7,7 +7,6 @@ calls a thread, whatever the number of robots. Results do not depend on the numb
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tutelage.cores import available_cores
 from tutelage.errors import MissingExtraError
 
 try:
@@ -252,8 +252,3 @@ def wait(futures: list[Future[None]]) -> None:
     """Wait for background work and raise what it raised."""
     for future in futures:
         future.result()
-
-
-def available_cores() -> int:
-    """How many cores this process may use (respects affinity masks)."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tutelage.cores import default_torch_threads
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import find_task, load_object, make_fleet
@@ -48,8 +49,11 @@ class Assembly:
     policy: EnsemblePolicy
     learner: ImitationLearner
 
-    def loop(self) -> Loop:
-        """The loop over these parts; thresholds must be resolved."""
+    def loop(self, frozen: Policy | None = None) -> Loop:
+        """The loop over these parts; thresholds must be resolved.
+
+        frozen: act with this policy instead, and learn nothing: an evaluation, on random streams that training never uses.
+        """
         c = self.config
         priority = parse(c.priority, c.thresholds)
         critics = self.learner.critics
@@ -59,17 +63,11 @@ class Assembly:
         if c.supervisor_noise:
             sigma = c.supervisor_noise * float((self.fleet.action_high - self.fleet.action_low).mean() / 2)
             supervisor = NoisySupervisor(supervisor, sigma, stream(c.seed, "supervisor noise"))
-        return Loop(
-            self.fleet,
-            self.policy,
-            priority,
-            Team([supervisor] * c.humans, c.latency),
-            FleetDAgger(c.t_teleop, c.t_reset),
-            self.learner,
-            {name: _estimate(critic) for name, critic in critics.items()},
-            overlap=c.overlap,
-            seed=c.seed,
-        )
+        team, omega = Team([supervisor] * c.humans, c.latency), FleetDAgger(c.t_teleop, c.t_reset)
+        if frozen is not None:
+            return Loop(self.fleet, frozen, priority, team, omega, seed=derive(c.seed, "evaluation"))
+        signals = {name: _estimate(critic) for name, critic in critics.items()}
+        return Loop(self.fleet, self.policy, priority, team, omega, self.learner, signals, overlap=c.overlap, seed=c.seed)
 
 
 def assemble(config: RunConfig) -> Assembly:
@@ -78,9 +76,9 @@ def assemble(config: RunConfig) -> Assembly:
     Raises:
         ConfigError: an unknown task, level or priority, or a combination that cannot work.
     """
-    torch.set_num_threads(config.torch_threads)
     find_task(config.task)
     config = _resolve_defaults(config)
+    torch.set_num_threads(config.torch_threads or 1)
     priority = parse(config.priority, config.thresholds)
     actor = _expert(config)
     fleet = make_fleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)
@@ -197,6 +195,8 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
     if t.initial is None:
         initial = task.initial_period if task and config.priority.strip(".") == "C.U.R" else 0
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
+    if config.torch_threads is None:
+        changes["torch_threads"] = default_torch_threads()
     if set(config.priority.split(".")) <= {"C", ""}:
         # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).
         changes["learner"] = dataclasses.replace(config.learner, schedule="never")

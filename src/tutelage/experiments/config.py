@@ -20,7 +20,7 @@ from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
 from tutelage.learning.ppo import PPOConfig
 
-FORMAT = 1
+FORMAT = 2
 """Version of a run folder. A folder of another version is refused, never guessed at."""
 
 
@@ -55,7 +55,7 @@ class RunConfig:
             shipped with the task.
         overlap: learn while physics runs (the update at step t then sees the data up to t - 1).
         threads: physics threads; default: all cores.
-        torch_threads: threads of matrix products; more than 2 is rarely faster.
+        torch_threads: threads of matrix products; default: all cores, at most 4 (more are rarely faster).
         out: run folder; default: runs/TASK-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.
@@ -86,7 +86,7 @@ class RunConfig:
     expert: str | None = None
     overlap: bool = False
     threads: int | None = None
-    torch_threads: int = 2
+    torch_threads: int | None = None
     out: Path | None = None
     checkpoint_every: int = 1000
     metrics_every: int = 20
@@ -94,13 +94,10 @@ class RunConfig:
     label: str | None = None
 
     def __post_init__(self) -> None:
-        at_least = {
-            "robots": 1, "humans": 1, "steps": 1, "t_teleop": 1, "t_reset": 1, "latency": 0,
-            "calibration_steps": 1, "members": 1, "torch_threads": 1, "checkpoint_every": 1, "metrics_every": 1, "seed": 0,
-        }  # fmt: skip
-        for name, least in at_least.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        _at_least(
+            self, robots=1, humans=1, steps=1, t_teleop=1, t_reset=1, latency=0, offline_pairs=1, calibration_steps=1,
+            members=1, threads=1, torch_threads=1, checkpoint_every=1, metrics_every=1, seed=0,
+        )  # fmt: skip
         if self.humans > self.robots:
             raise ConfigError(f"{self.humans} humans for {self.robots} robots: use at most one human a robot (M <= N)")
         if not 0 <= self.supervisor_noise < math.inf:
@@ -109,10 +106,6 @@ class RunConfig:
             raise ConfigError(f"hidden layers must be at least 1 wide, got {self.hidden}")
         if self.record not in ("human", "all", "none"):
             raise ConfigError(f"unknown record {self.record!r}: use human, all or none")
-        if self.offline_pairs is not None and self.offline_pairs < 1:
-            raise ConfigError(f"offline_pairs must be at least 1, got {self.offline_pairs}")
-        if self.threads is not None and self.threads < 1:
-            raise ConfigError(f"threads must be at least 1, got {self.threads}")
 
     @property
     def folder(self) -> Path:
@@ -139,7 +132,7 @@ class ExpertConfig:
         out: folder of checkpoints and weights; default: runs/expert-TASK. If it holds a checkpoint, training goes on.
         evaluate_every: environment steps between evaluations; the best policy so far is kept.
         threads: physics threads; default: all cores.
-        torch_threads: threads of matrix products.
+        torch_threads: likewise for matrix products; default: all cores, at most 4.
         ppo: hyper-parameters.
     """
 
@@ -151,13 +144,18 @@ class ExpertConfig:
     out: Path | None = None
     evaluate_every: int = 500_000
     threads: int | None = None
-    torch_threads: int = 2
+    torch_threads: int | None = None
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "robots", "evaluate_every", "torch_threads"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
+        _at_least(self, steps=1, robots=1, evaluate_every=1, threads=1, torch_threads=1)
+
+
+def _at_least(config: Any, **least: int) -> None:
+    for name, bound in least.items():
+        value = getattr(config, name)
+        if value is not None and value < bound:  # None: decided later
+            raise ConfigError(f"{name} must be at least {bound}, got {value}")
 
 
 def to_json(config: Any) -> dict[str, Any]:

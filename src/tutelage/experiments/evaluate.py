@@ -9,16 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from tutelage.errors import ConfigError
-from tutelage.experiments.assemble import Assembly, assemble
+from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.run import read_config
-from tutelage.fleet.allocation import FleetDAgger
-from tutelage.fleet.loop import Loop
 from tutelage.fleet.metrics import Counting, Tally
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import Uncertainty, parse
 from tutelage.fleet.step import Subscriber
-from tutelage.fleet.supervisor import PolicySupervisor, Team
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.store import write_atomic
 
@@ -33,28 +30,21 @@ def evaluate_policy(
     """Run a frozen policy for `config.steps` timesteps; returns the metrics.
 
     Args:
-        config: task, N, M, T, seed and disturbance are taken from it. The random streams are those of the seed's
-            evaluation, which training never uses.
+        config: of the run: everything but its learning and its initial period t_I is taken from it.
         policy: the policy; None: the algorithmic expert itself.
         priority: who gets help; "C." gives hard resets and nothing else. Terms that look at the policy's signals
             need a policy that has them.
         tally: where to count, for a display that watches it.
         subscribers: listeners, such as a progress display.
     """
-    assembly: Assembly = assemble(dataclasses.replace(config, priority=priority))
-    terms, thresholds = parse(priority, assembly.config.thresholds), assembly.config.thresholds
-    if thresholds.uncertainty is None and any(isinstance(term, Uncertainty) for term in terms.terms):
+    # The period t_I without hard resets belongs to the beginning of learning.
+    thresholds = dataclasses.replace(config.thresholds, initial=0)
+    if thresholds.uncertainty is None and any(isinstance(term, Uncertainty) for term in parse(priority, thresholds).terms):
         raise ConfigError(f"this run has no threshold of uncertainty, which {priority} needs; choose C. or Random.")
+    assembly = assemble(dataclasses.replace(config, priority=priority, thresholds=thresholds))
     tally = tally or Tally(config.robots, config.humans)
-    loop = Loop(
-        assembly.fleet,
-        assembly.actor if policy is None else policy,
-        terms,
-        Team([PolicySupervisor(assembly.actor)] * config.humans, config.latency),
-        FleetDAgger(config.t_teleop, config.t_reset),
-        subscribers=[Counting(tally), *subscribers],
-        seed=config.seed + 1_000_000,
-    )
+    loop = assembly.loop(frozen=assembly.actor if policy is None else policy)
+    loop.subscribers = [Counting(tally), *subscribers]
     loop.run(config.steps)
     assembly.fleet.close()
     return tally.summary()

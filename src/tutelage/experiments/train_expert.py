@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from tutelage.cores import default_torch_threads
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.experiments.config import ExpertConfig
@@ -20,7 +21,7 @@ from tutelage.store import load_tree
 
 def train(config: ExpertConfig, say: Callable[[str], None] = print) -> Path:
     """Train, score and save a controller; returns the path of its weights."""
-    torch.set_num_threads(config.torch_threads)
+    torch.set_num_threads(config.torch_threads or default_torch_threads())
     out = config.out or Path("runs") / f"expert-{config.task}"
     fleet = MujocoFleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)
     level = config.disturbance or fleet.task.disturbance

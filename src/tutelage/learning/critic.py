@@ -61,46 +61,46 @@ class CriticConfig:
 
 
 class Ring:
-    """The newest transitions: obs, action, next_obs, end."""
+    """The newest transitions, one behind the other in each row: obs, action, next_obs, end."""
 
     def __init__(self, capacity: int, obs_width: int, action_width: int) -> None:
         self.capacity, self.size, self.cursor = capacity, 0, 0
-        self.columns = {
-            "obs": torch.zeros(0, obs_width),
-            "action": torch.zeros(0, action_width),
-            "next_obs": torch.zeros(0, obs_width),
-            "end": torch.zeros(0),
-        }
+        self.widths = {"obs": obs_width, "action": action_width, "next_obs": obs_width, "end": 1}
+        self.rows = torch.zeros(0, sum(self.widths.values()))
 
-    def add(self, **rows: Array) -> None:
-        """Append n transitions; memory grows up to the capacity, then the oldest give way."""
-        n = len(rows["end"])
-        if n > self.capacity:
-            rows, n = {k: v[-self.capacity :] for k, v in rows.items()}, self.capacity
-        room = len(self.columns["end"])
-        if self.size + n > room and room < self.capacity:
-            more = min(max(1024, 2 * room, self.size + n), self.capacity) - room
-            self.columns = {k: torch.cat([c, c.new_zeros(more, *c.shape[1:])]) for k, c in self.columns.items()}
-        room = len(self.columns["end"])
-        index = torch.from_numpy((self.cursor + np.arange(n)) % room) if room else torch.zeros(0, dtype=torch.long)
-        for name, column in self.columns.items():
-            column[index] = torch.from_numpy(np.asarray(rows[name], dtype=np.float32))
-        self.cursor = (self.cursor + n) % max(room, 1) if room == self.capacity else self.cursor + n
-        self.size = min(self.size + n, room)
+    def add(self, rows: Array) -> None:
+        """Append transitions (n, width); memory grows up to the capacity, then the oldest give way."""
+        rows = rows[-self.capacity :]
+        wanted, room = self.size + len(rows), len(self.rows)
+        if room < min(wanted, self.capacity):
+            more = min(max(1024, 2 * room, wanted), self.capacity) - room
+            self.rows = torch.cat([self.rows, self.rows.new_zeros(more, self.rows.shape[1])])
+        first = rows[: len(self.rows) - self.cursor]
+        rest = rows[len(first) :]
+        self.rows[self.cursor : self.cursor + len(first)] = torch.from_numpy(first)
+        self.rows[: len(rest)] = torch.from_numpy(rest)
+        self.cursor += len(rows)
+        if self.cursor >= self.capacity:
+            self.cursor -= self.capacity
+        self.size = min(wanted, self.capacity)
 
-    def draw(self, n: int, rng: np.random.Generator) -> dict[str, Tensor]:
-        """n transitions drawn uniformly with replacement."""
-        index = torch.from_numpy(rng.integers(self.size, size=n))
-        return {name: column[index] for name, column in self.columns.items()}
+    def columns(self, rows: Tensor) -> dict[str, Tensor]:
+        """The parts of rows (n, width), by name: views."""
+        parts = dict(zip(self.widths, rows.split(list(self.widths.values()), dim=1), strict=True))
+        return {**parts, "end": parts["end"][:, 0]}
+
+    def draw(self, n: int, rng: np.random.Generator) -> Tensor:
+        """n transitions drawn uniformly with replacement, (n, width)."""
+        return self.rows.index_select(0, torch.from_numpy(rng.integers(self.size, size=n)))
 
     def state_dict(self) -> dict[str, Any]:
         """The transitions and where the next one goes (copies: later transitions overwrite these rows)."""
-        return {"cursor": self.cursor, "columns": {k: c[: self.size].numpy().copy() for k, c in self.columns.items()}}
+        return {"cursor": self.cursor, "rows": self.rows[: self.size].numpy().copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.columns = {k: torch.from_numpy(c.copy()) for k, c in state["columns"].items()}
-        self.size, self.cursor = len(self.columns["end"]), state["cursor"]
+        self.rows = torch.from_numpy(state["rows"].copy())
+        self.size, self.cursor = len(self.rows), state["cursor"]
 
 
 class Critic:
@@ -145,9 +145,9 @@ class Critic:
 
     def add(self, obs: Array, action: Array, next_obs: Array, event: Array, end: Array) -> None:
         """Take in n transitions. event: (n,) bool, it happened in this step; end: (n,) bool, nothing can follow."""
-        rows = {"obs": obs, "action": action, "next_obs": next_obs, "end": end}
-        self.events.add(**{k: v[event] for k, v in rows.items()})
-        self.plain.add(**{k: v[~event] for k, v in rows.items()})
+        rows = np.concatenate([obs, action, next_obs, end[:, None]], axis=1, dtype=np.float32)
+        self.events.add(rows[event])
+        self.plain.add(rows[~event])
 
     def update(self) -> float:
         """One gradient step; returns the loss (NaN when there are no transitions yet)."""
@@ -155,16 +155,15 @@ class Critic:
             return float("nan")
         # At least one, or a small batch would never show an event.
         positives = max(1, round(self.config.positives * self.config.batch)) if self.events.size else 0
-        batch = self.plain.draw(self.config.batch - positives, self.rng)
-        event = torch.zeros(self.config.batch)
+        rows = self.plain.draw(self.config.batch - positives, self.rng)
         if positives:
-            more = self.events.draw(positives, self.rng)
-            batch = {k: torch.cat([v, more[k]]) for k, v in batch.items()}
-            event[-positives:] = 1.0
+            rows = torch.cat([rows, self.events.draw(positives, self.rng)])
+        batch = self.plain.columns(rows)
+        event = torch.arange(len(rows)) >= len(rows) - positives
         with torch.no_grad():
             then = torch.from_numpy(np.asarray(self.policy.act(batch["next_obs"].numpy()), np.float32))
             future = self._worst(self._q(self.target, batch["next_obs"], then))
-            y = event + self.config.gamma * (1 - event) * (1 - batch["end"]) * future
+            y = torch.where(event, 1.0, self.config.gamma * (1 - batch["end"]) * future)
         loss = (self._q(self.net, batch["obs"], batch["action"]) - y).square().mean(dim=1).sum()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()

@@ -79,13 +79,12 @@ class AggregatedDataset:
         """An independent batch for each member, drawn from its bag: obs (K, size, ...), actions (K, size, A)."""
         if not len(self):
             raise ConfigError("there are no human data to learn from yet; give offline data or wait for interventions")
-        index = torch.stack([self._draw(bag, size) for bag in self.bags])
-        return self.obs.rows[index], self.actions.rows[index]
-
-    def _draw(self, bag: GrowingArray, size: int) -> Tensor:
-        if not bag.size:  # possible only with a handful of pairs
-            return torch.from_numpy(self.rng.integers(len(self), size=size))
-        return bag.rows[torch.from_numpy(self.rng.integers(bag.size, size=size))]
+        # A bag can be empty only with a handful of pairs; its member then learns from all of them.
+        bags = [bag.rows if bag.size else torch.arange(len(self)) for bag in self.bags]
+        draws = torch.from_numpy(self.rng.integers(np.array([[len(bag)] for bag in bags]), size=(len(bags), size)))
+        index = torch.cat([bag.index_select(0, draw) for bag, draw in zip(bags, draws, strict=True)])
+        obs, actions = (rows.index_select(0, index) for rows in (self.obs.rows, self.actions.rows))
+        return obs.unflatten(0, draws.shape), actions.unflatten(0, draws.shape)
 
     def state_dict(self) -> dict[str, Any]:
         """All pairs, bags and the random state."""

@@ -38,14 +38,14 @@ class BatchedMLP(nn.Module):
             bound = 1 / math.sqrt(a)
             for parameters, shape in ((self.weights, (members, a, b)), (self.biases, (members, 1, b))):
                 parameters.append(nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) * bound))
+        self._layers = list(zip(self.weights, self.biases, strict=True))  # a ParameterList takes long to say what it holds
 
     def forward(self, x: Tensor) -> Tensor:
         """(K, B, inputs), or (B, inputs) for the same inputs to all members -> (K, B, outputs)."""
         if x.dim() == 2:
-            x = x.expand(len(self.weights[0]), *x.shape)
-        depth = len(self.weights)
-        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = x.expand(len(self._layers[0][0]), *x.shape)
+        for k, (weight, bias) in enumerate(self._layers):
             x = torch.baddbmm(bias, x, weight)
-            if k < depth - 1:
+            if k < len(self._layers) - 1:
                 x = x.relu_()  # in place: the sum before it is not needed for gradients
         return self.last(x) if self.last else x

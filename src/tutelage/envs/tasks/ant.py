@@ -37,12 +37,12 @@ class Ant(MujocoTask):
     def healthy(self, frame: Frame) -> NDArray[np.bool_]:
         """Whether each robot earns Gymnasium's reward for being healthy, (N,): it depends on the torso's height alone."""
         z = frame["qpos"][:, 2]
-        return (z >= 0.2) & (z <= 1.0)  # type: ignore[no-any-return]
+        return np.asarray((z >= 0.2) & (z <= 1.0))
 
     def violation(self, frame: Frame) -> NDArray[np.bool_]:
         w, x, y, z = frame["qpos"][:, 3:7].T
         upward = w * w + z * z - x * x - y * y  # the vertical component of the torso's own vertical axis
-        return ~(self.healthy(frame) & (upward > 0.0))
+        return np.asarray(~(self.healthy(frame) & (upward > 0.0)))
 
     def initial(self, rng: np.random.Generator, n: int, qpos0: Array, qvel0: Array) -> tuple[Array, Array]:
         return (
