@@ -54,8 +54,11 @@ class Ours:
         self.loop.subscribers = [self.moved]
         self.loop.run(WARM)
 
-    def __call__(self) -> None:
+    def threads(self) -> None:
+        """Give matrix products as many threads as this run does; not part of what is timed."""
         torch.set_num_threads(self.torch_threads)
+
+    def __call__(self) -> None:
         self.loop.run(self.loop.t + self.steps)
 
 
@@ -100,7 +103,9 @@ class RawGradients:
             for ring in (critic.plain, critic.events):
                 drawn: dict[int, Any] = {}
                 draw = ring.draw
-                ring.draw = lambda n, rng, drawn=drawn, draw=draw: drawn.get(n) or drawn.setdefault(n, draw(n, rng))  # type: ignore[method-assign]
+                ring.draw = lambda n, rng, drawn=drawn, draw=draw: (
+                    drawn[n] if n in drawn else drawn.setdefault(n, draw(n, rng))
+                )  # type: ignore[method-assign]
 
     def __call__(self) -> None:
         for t in range(self.steps):
@@ -168,11 +173,15 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
             {
                 "original": lambda: original.run(steps), "ours": lockstep, "ours, overlap": overlap,
                 "raw physics": physics, "raw gradients": gradients,
-            }, rounds, before={"raw physics": physics.rewind},
+            }, rounds, before={
+                "original": lockstep.threads, "ours": lockstep.threads, "ours, overlap": overlap.threads,
+                "raw physics": physics.rewind, "raw gradients": lockstep.threads,
+            },
         )  # fmt: skip
     finally:
         mujoco_fleet.wait = wait  # type: ignore[attr-defined]
     original.envs.close()
+    lockstep.threads()
     floors = ("raw physics", "raw gradients")
     return {
         "milliseconds": {name: 1e3 * float(np.median(seconds[name])) / steps for name in VARIANTS},

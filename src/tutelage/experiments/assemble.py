@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tutelage.cores import default_torch_threads
+from tutelage.cores import available_cores, default_torch_threads
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import find_task, load_object, make_fleet
@@ -196,7 +196,9 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
         initial = task.initial_period if task and config.priority.strip(".") == "C.U.R" else 0
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
     if config.torch_threads is None:
-        changes["torch_threads"] = default_torch_threads()
+        changes["torch_threads"] = 1 if config.overlap else default_torch_threads()
+    if config.threads is None and config.overlap:
+        changes["threads"] = max(1, available_cores() - 1)  # the last core learns
     if set(config.priority.split(".")) <= {"C", ""}:
         # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).
         changes["learner"] = dataclasses.replace(config.learner, schedule="never")
