@@ -199,3 +199,18 @@ def make_loop(
     """A loop with `humans` alike supervisors, and a policy that stands still unless another one is given."""
     team = Team([supervisor or FakeSupervisor()] * humans, latency)
     return Loop(fleet, rest.pop("policy", FakePolicy()), priority, team, **rest)
+
+
+def make_view(
+    t: int = 0, *, violation: Sequence[bool] = (False,) * 4, supervised: Any = None, fresh: Any = None,
+    discrepancy: Any = None, humans: int = 1, seed: int = 0, **signals: Any,
+) -> FleetView:  # fmt: skip
+    """Four robots (or as many as `violation` has) with the given signals."""
+    n = len(violation)
+    helped, new = (np.zeros(n, dtype=bool) if mask is None else np.array(mask) for mask in (supervised, fresh))
+    differs = np.full(n, np.nan) if discrepancy is None else np.array(discrepancy, dtype=float)
+    return FleetView(
+        t, np.zeros((n, 2)), np.zeros((n, 1)), np.array(violation), helped, np.zeros(n, dtype=int),
+        np.full((n, 1), np.nan), differs, new, humans, np.random.default_rng(seed),
+        {name: (lambda view, value=value: np.array(value)) for name, value in signals.items()},
+    )  # fmt: skip

@@ -378,8 +378,9 @@ def check_priority(priority: Priority, fleet: Fleet | int, *, seed: int = 0) -> 
         _demand(not np.isnan(raw).any(), f"{name} returned NaN; a robot that needs nobody has priority 0")
         _demand(columns in (0, raw.shape[1]), f"{name} must always return the same number of columns")
         columns = raw.shape[1]
-        for part in ("obs", "actions", "violation", "supervised", "duration", "human_action"):
-            same = np.array_equal(getattr(view, part), getattr(again, part), equal_nan=part == "human_action")
+        for part in ("obs", "actions", "violation", "supervised", "duration", "human_action", "discrepancy", "fresh"):
+            nan = part in ("human_action", "discrepancy")  # where no human acted
+            same = np.array_equal(getattr(view, part), getattr(again, part), equal_nan=nan)
             _demand(same, f"{name} changes view.{part}; a priority only looks")
         for signal, value in view.computed.items():
             _demand(
@@ -414,15 +415,20 @@ def _view(fleet: Fleet | int, t: int, seed: int) -> FleetView:
         obs = obs.astype(fleet.single_observation_space.dtype)
     human = rng.uniform(low, high, (n, len(low))).astype(np.float32)
     human[rng.random(n) < 0.5] = np.nan
-    numbers = {signal: np.where(rng.random(n) < 0.2, 0.0, rng.random(n)) for signal in ("uncertainty", "risk", "goal")}
+    names = ("uncertainty", "risk", "goal", "predicted_discrepancy", "judgement")
+    numbers = {signal: np.where(rng.random(n) < 0.2, 0.0, rng.random(n)) for signal in names}
+    supervised = rng.random(n) < 0.3
     return FleetView(
         t=t,
         obs=obs,
         actions=rng.uniform(low, high, (n, len(low))).astype(np.float32),
         violation=rng.random(n) < 0.3,
-        supervised=rng.random(n) < 0.3,
+        supervised=supervised,
         duration=rng.integers(0, 10, n),
         human_action=human,
+        discrepancy=np.where(supervised, rng.random(n), np.nan),
+        fresh=rng.random(n) < 0.1,
+        num_humans=max(1, n // 3),
         rng=stream(seed, f"checks/priority/{t}"),
         signals={signal: lambda view, value=value: value for signal, value in numbers.items()},  # type: ignore[misc]
     )

@@ -533,7 +533,7 @@ def same(one: Step, other: Step) -> None:
         elif isinstance(a, tuple):
             assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True)), f.name
         else:
-            assert np.array_equal(a, b), f.name
+            assert np.array_equal(a, b, equal_nan=f.name == "wanted"), f.name
 
 
 def full_loop(seed: int, text: str, schedule: Any, overlap: bool):

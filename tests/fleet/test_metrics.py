@@ -269,7 +269,9 @@ def replayed_steps(log: EventLog) -> list[Step]:
         events = Events(*(column[log.events.t == t] for column in log.events))
         reward = np.bincount(events.of(Event.SUCCESS).robot, minlength=log.num_robots).astype(np.float64)
         result.append(
-            Step(t, nothing, nothing, nothing, modes[t], nothing, reward, nothing, nothing, nothing, nothing, events)
+            Step(
+                t, nothing, nothing, nothing, nothing, modes[t], nothing, reward, nothing, nothing, nothing, nothing, events
+            )
         )
     return result
 

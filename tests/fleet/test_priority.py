@@ -6,24 +6,13 @@ import json
 
 import numpy as np
 import pytest
+from fakes import make_view as view
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.priority import Priority, PriorityConfig, parse
-from tutelage.fleet.view import FleetView
-
-
-def view(t: int = 0, *, violation=(False,) * 4, supervised=None, seed: int = 0, **signals) -> FleetView:
-    """Four robots (or as many as `violation` has) with the given signals."""
-    n = len(violation)
-    helped = np.zeros(n, dtype=bool) if supervised is None else np.array(supervised)
-    return FleetView(
-        t, np.zeros((n, 2)), np.zeros((n, 1)), np.array(violation), helped, np.zeros(n, dtype=int),
-        np.full((n, 1), np.nan), default_rng(seed), {k: (lambda v, x=x: np.array(x)) for k, x in signals.items()},
-    )  # fmt: skip
-
 
 FALLEN = (True, False, False, False)
 CONFIG = PriorityConfig(uncertainty=0.3, risk=0.5, initial=10, random=0.5)

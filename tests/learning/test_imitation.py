@@ -39,7 +39,7 @@ def step(modes, *, t: int = 0, **masks) -> Step:
     index = np.arange(n, dtype=float)[:, None]
     mask = {name: np.array(masks.get(name, [False] * n)) for name in ("violation", "success", "truncated")}
     return Step(
-        t, np.repeat(index, WIDTH, 1), index * 0, index / 10, np.array(modes), np.full(n, -1), np.zeros(n),
+        t, np.repeat(index, WIDTH, 1), index * 0, index / 9, index / 10, np.array(modes), np.full(n, -1), np.zeros(n),
         np.repeat(index + 100, WIDTH, 1), mask["violation"], mask["success"], mask["truncated"], Events.concatenate([]),
     )  # fmt: skip
 

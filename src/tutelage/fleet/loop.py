@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
+from tutelage.fleet.discrepancy import discrepancy
 from tutelage.fleet.events import Journal
+from tutelage.fleet.execution import AsWanted, Execution
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.modes import HELPED, MOVING, Event, Mode, transition
 from tutelage.fleet.policy import Learner, Policy
@@ -41,6 +43,7 @@ class Loop:
         learner: the update function f of eq. 5.3; None: the policy stays as it is.
         signals: how to compute what the priority looks at, by name; `uncertainty` is the policy's own by default.
         subscribers: listeners.
+        execution: what a robot executes while a human is in control; by default what the human wants.
         overlap: learn while physics runs. The update at step t then sees the data up to t - 1; it still changes the
             policy from t + 1 on.
         seed: root seed.
@@ -56,6 +59,7 @@ class Loop:
         learner: Learner | None = None,
         signals: Mapping[str, Signal] | None = None,
         subscribers: Sequence[Subscriber] = (),
+        execution: Execution | None = None,
         overlap: bool = False,
         seed: int = 0,
     ) -> None:
@@ -64,7 +68,7 @@ class Loop:
         if team.latency.any() and not fleet.can_pause:
             raise ConfigError("switching latency needs a fleet that can pause robots, and this one cannot")
         self.fleet, self.policy, self.priority, self.team = fleet, policy, priority, team
-        self.allocator = allocator or FleetDAgger()
+        self.allocator, self.execution = allocator or FleetDAgger(), execution or AsWanted()
         self.learner, self.overlap, self.subscribers = learner, overlap, list(subscribers)
         self.signals: dict[str, Signal] = {"uncertainty": lambda view: policy.uncertainty(view.obs)}  # type: ignore[attr-defined]
         if not hasattr(policy, "uncertainty"):
@@ -82,6 +86,8 @@ class Loop:
         self.age = np.zeros(n, dtype=np.int64)
         self.robot_of = np.full(len(team), NOBODY)
         self.human_action = np.full((n, len(fleet.action_low)), np.nan, dtype=np.float32)
+        self.discrepancy = np.full(n, np.nan)
+        self.fresh = np.ones(n, dtype=bool)
         self.journal = Journal()
         self.obs, info = fleet.reset(seed=derive(seed, "fleet") % 2**32)
         self.violation = info["violation"]
@@ -104,7 +110,7 @@ class Loop:
         self.journal.t, self.in_step = self.t, True
         view = self._observe()
         self._allocate(self.priority(view))
-        actions, mode, human = self._act(view), self.mode.copy(), self.human_of
+        (actions, wanted), mode, human = self._act(view), self.mode.copy(), self.human_of
         losses: dict[str, float] = {}
 
         self.fleet.step_async(actions, active=MOVING[mode])
@@ -115,7 +121,7 @@ class Loop:
         success = info["success"] & ~info["violation"]  # a robot that fell has not completed anything
         self._finish(next_obs, info["violation"], success, truncated)
         step = Step(
-            self.t, view.obs, view.actions, actions, mode, human, reward, next_obs,
+            self.t, view.obs, view.actions, actions, wanted, mode, human, reward, next_obs,
             info["violation"], success, truncated, self.journal.take(), view.computed, losses,
         )  # fmt: skip
         if self.learner:
@@ -144,8 +150,9 @@ class Loop:
             raise ContractError(f"{type(self.policy).__name__}.act must return {expected}, got {actions.shape}")
         self._check(actions, f"the action of {type(self.policy).__name__}")
         return FleetView(
-            self.t, self.obs, actions, self.violation, HELPED[self.mode], self.age, self.human_action, self.rng, self.signals
-        )
+            self.t, self.obs, actions, self.violation, HELPED[self.mode], self.age, self.human_action, self.discrepancy,
+            self.fresh, len(self.team), self.rng, self.signals,
+        )  # fmt: skip
 
     def _allocate(self, ranks: Array) -> None:
         if ranks.ndim != 2 or len(ranks) != self.fleet.num_envs or not ranks.shape[1]:
@@ -168,14 +175,17 @@ class Loop:
         self._happen(Event.START_RESET, robots[ready & broken], busy[ready & broken])
         self._happen(Event.TAKE_OVER, robots[ready & ~broken], busy[ready & ~broken])
 
-    def _act(self, view: FleetView) -> Array:
+    def _act(self, view: FleetView) -> tuple[Array, Array]:
         actions = view.actions.astype(np.float32, copy=True)
+        wanted, self.discrepancy = np.full_like(actions, np.nan), np.full(len(actions), np.nan)
         (robots,) = np.nonzero(self.mode == Mode.TELEOPERATED)
         if robots.size:
             low, high = self.fleet.action_low, self.fleet.action_high
-            commanded = self.team.act(view.obs[robots], robots, self.human_of[robots], actions.shape[1])
-            actions[robots] = self.human_action[robots] = np.clip(commanded, low, high)
-        return actions
+            said = np.clip(self.team.act(view.obs[robots], robots, self.human_of[robots], actions.shape[1]), low, high)
+            wanted[robots] = self.human_action[robots] = said
+            self.discrepancy[robots] = discrepancy(view.actions[robots], said, low, high)
+            actions[robots] = np.clip(self.execution(self.t, said, view.actions[robots]), low, high)
+        return actions, wanted
 
     def _finish(self, obs: Array, violation: Array, success: Array, truncated: Array) -> None:
         """End of the step: note what happened, reset whom it is due, and look again."""
@@ -192,7 +202,7 @@ class Loop:
 
         again = moving & (success | truncated) & ~violation
         again[righted] = True
-        self.obs, self.violation = obs, violation
+        self.obs, self.violation, self.fresh = obs, violation, again
         if again.any():
             self._check(obs, "the last observation")  # the loop goes on from another one, but critics learn from it
             self.obs, info = self.fleet.reset(options={"reset_mask": again})
@@ -223,11 +233,14 @@ class Loop:
             "age": self.age.copy(),
             "robot_of": self.robot_of.copy(),
             "human_action": self.human_action.copy(),
+            "discrepancy": self.discrepancy.copy(),
+            "fresh": self.fresh.copy(),
             "obs": np.array(self.obs),
             "violation": np.array(self.violation),
             "fleet": self.fleet.state_dict(),
             "team": self.team.state_dict(),
             "priority": self.priority.state_dict(),
+            "execution": self.execution.state_dict(),
             **({"learner": self.learner.state_dict()} if self.learner else {}),
         }
 
@@ -235,10 +248,11 @@ class Loop:
         """Restore what `state_dict` returned."""
         self.t = state["t"]
         set_rng_state(self.rng, state["rng"])
-        for name in ("mode", "age", "robot_of", "human_action", "obs", "violation"):
+        for name in ("mode", "age", "robot_of", "human_action", "discrepancy", "fresh", "obs", "violation"):
             setattr(self, name, state[name].copy())
         self.fleet.load_state_dict(state["fleet"])
         self.team.load_state_dict(state["team"])
         self.priority.load_state_dict(state["priority"])
+        self.execution.load_state_dict(state["execution"])
         if self.learner:
             self.learner.load_state_dict(state["learner"])

@@ -8,10 +8,13 @@ for which all terms are 0 asks for nobody. Every algorithm and ablation of chapt
     U.C.    Fleet-EnsembleDAgger  uncertain robots, then violated ones
     U.G.C.  Fleet-ThriftyDAgger   uncertainty and risk of missing the goal as one number, then violated ones
     C.U.R.  Constraint-Uncertainty-Risk
+
+The gates of chapters 2 and 3 are terms too, by name. "LazyDAgger" alone is "LazyDAgger.C.": who asks, then who fell.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -20,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.errors import ConfigError, ContractError
+from tutelage.fleet.gates import GATES, GateConfig
 from tutelage.fleet.view import FleetView
 
 Array = NDArray[Any]
@@ -194,9 +198,10 @@ class Lexicographic:
     def __call__(self, view: FleetView) -> Array:
         columns = [term(view) for term in self.terms]
         for term, column in zip(self.terms, columns, strict=True):
-            if column.shape != (view.num_robots,):
+            if column.shape[:1] != (view.num_robots,) or column.ndim > 2:
                 raise ContractError(f"{type(term).__name__} must return ({view.num_robots},), got {column.shape}")
-        return np.array(columns, dtype=np.float64).T  # columns stay contiguous: allocation sorts column by column
+        # Columns stay contiguous: allocation sorts column by column.
+        return np.vstack([column.T for column in columns], dtype=np.float64).T
 
     def state_dict(self) -> dict[str, Any]:
         """What the terms remember, by position."""
@@ -208,24 +213,35 @@ class Lexicographic:
             self.terms[int(k)].load_state_dict(inner)
 
 
-def parse(text: str, config: PriorityConfig | None = None) -> Lexicographic:
-    """The priority that a string such as "C.U.R." names. Neighbours "U.G." become one combined term.
+def parse(text: str, config: PriorityConfig | None = None, gate: GateConfig | None = None) -> Lexicographic:
+    """The priority that a string such as "C.U.R." or "LazyDAgger" names. Neighbours "U.G." become one combined term.
+
+    Args:
+        text: terms with dots between them; a gate alone is followed by "C".
+        config: numbers of the terms.
+        gate: numbers of the gates.
 
     Raises:
         ConfigError: an unknown or repeated term.
     """
-    config = config or PriorityConfig()
+    config, gate = config or PriorityConfig(), gate or GateConfig()
+    if gate.doubt is None:
+        gate = dataclasses.replace(gate, doubt=config.uncertainty)
     names = [part for part in text.split(".") if part]
-    unknown = [name for name in names if name not in TERMS]
+    unknown = [name for name in names if name not in TERMS and name not in GATES]
     if not names or unknown or len(set(names)) < len(names):
         raise ConfigError(
-            f"cannot read the priority {text!r}: use different terms of {', '.join(TERMS)} with dots, such as C.U.R."
+            f"cannot read the priority {text!r}: use different terms of {', '.join(TERMS)} with dots, such as C.U.R., "
+            f"or one of {', '.join(GATES)}"
         )
+    if len(names) == 1 and names[0] in GATES:
+        names.append("C")
     terms: list[Any] = []
     while names:
         if names[:2] == ["U", "G"]:
             terms.append(UncertaintyGoal(config))
             names = names[2:]
         else:
-            terms.append(TERMS[names.pop(0)](config))
+            name = names.pop(0)
+            terms.append(GATES[name](gate) if name in GATES else TERMS[name](config))
     return Lexicographic(text, terms)

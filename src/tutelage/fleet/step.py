@@ -23,7 +23,8 @@ class Step:
         t: index of the timestep, from 0.
         obs: (N, ...) what the robots saw.
         proposed: (N, A) what the policy would do.
-        actions: (N, A) what was executed (the human's action where teleoperated).
+        actions: (N, A) what was executed.
+        wanted: (N, A) what the humans wanted where teleoperated (executed unless an `Execution` changes it), else NaN.
         mode: (N,) the `Mode` of each robot during the step.
         human: (N,) the human who helps each robot during the step, or -1.
         reward: (N,) float64.
@@ -40,6 +41,7 @@ class Step:
     obs: Array
     proposed: Array
     actions: Array
+    wanted: Array
     mode: Array
     human: Array
     reward: Array

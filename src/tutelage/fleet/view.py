@@ -26,7 +26,11 @@ class FleetView:
         violation: (N,) bool, c(s).
         supervised: (N,) bool, whether a human is with the robot.
         duration: (N,) timesteps that each robot has been in its present mode.
-        human_action: (N, A) the last action a human executed on the robot (NaN before the first).
+        human_action: (N, A) the last action a human wanted of the robot (NaN before the first).
+        discrepancy: (N,) how far that was from what the policy proposed; see `discrepancy`. NaN for robots that no human
+            acted for in the last timestep.
+        fresh: (N,) bool, whether the robot's episode begins now.
+        num_humans: M.
         rng: the seeded stream of the priority, for random terms and tie-breaks.
         signals: how to compute each signal, by name, for all robots in one batch.
     """
@@ -38,6 +42,9 @@ class FleetView:
     supervised: Array
     duration: Array
     human_action: Array
+    discrepancy: Array
+    fresh: Array
+    num_humans: int
     rng: np.random.Generator
     signals: Mapping[str, Signal]
     computed: dict[str, Array] = field(default_factory=dict)

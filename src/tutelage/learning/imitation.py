@@ -104,7 +104,7 @@ class ImitationLearner:
         """Human actions into the dataset; every transition into the critics."""
         human = step.mode == Mode.TELEOPERATED
         if human.any():
-            self.dataset.add(step.obs[human], step.actions[human])
+            self.dataset.add(step.obs[human], step.wanted[human])
         self._episode_ended = bool((step.truncated | step.success | step.violation)[MOVING[step.mode]].any())
         if self.critics:
             moved = MOVING[step.mode]
