@@ -21,12 +21,16 @@ from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError, ContractError
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.allocation import FleetDAgger
+from tutelage.fleet.discrepancy import discrepancy
+from tutelage.fleet.execution import BetaMixture, Execution, NoiseInjection
 from tutelage.fleet.fleet import Fleet
+from tutelage.fleet.gates import DAgger, LazyDAgger
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.policy import Policy
-from tutelage.fleet.priority import parse
+from tutelage.fleet.priority import Lexicographic, parse
 from tutelage.fleet.supervisor import NoisySupervisor, PolicySupervisor, Supervisor, Team
 from tutelage.fleet.view import Signal
+from tutelage.learning.classifier import DiscrepancyClassifier
 from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.imitation import ImitationLearner
@@ -55,8 +59,7 @@ class Assembly:
         frozen: act with this policy instead, and learn nothing: an evaluation, on random streams that training never uses.
         """
         c = self.config
-        priority = parse(c.priority, c.thresholds)
-        critics = self.learner.critics
+        priority = parse(c.priority, c.thresholds, c.gate)
         if "goal" in priority.needs and not self.fleet.goal_conditioned:
             raise ConfigError(f"{c.priority} needs a task with a goal, and {c.task} has none; use C.U.R. or U.C.")
         supervisor: Supervisor = PolicySupervisor(self.actor)
@@ -64,10 +67,30 @@ class Assembly:
             sigma = c.supervisor_noise * float((self.fleet.action_high - self.fleet.action_low).mean() / 2)
             supervisor = NoisySupervisor(supervisor, sigma, stream(c.seed, "supervisor noise"))
         team, omega = Team([supervisor] * c.humans, c.latency), FleetDAgger(c.t_teleop, c.t_reset)
+        signals = self._signals()
         if frozen is not None:
-            return Loop(self.fleet, frozen, priority, team, omega, seed=derive(c.seed, "evaluation"))
-        signals = {name: _estimate(critic) for name, critic in critics.items()}
-        return Loop(self.fleet, self.policy, priority, team, omega, self.learner, signals, overlap=c.overlap, seed=c.seed)
+            return Loop(self.fleet, frozen, priority, team, omega, signals=signals, seed=derive(c.seed, "evaluation"))
+        return Loop(
+            self.fleet, self.policy, priority, team, omega, self.learner, signals,
+            execution=self._execution(priority), overlap=c.overlap, seed=c.seed,
+        )  # fmt: skip
+
+    def _signals(self) -> dict[str, Signal]:
+        """What the critics, the classifier and the humans' own judgement say."""
+        low, high = self.fleet.action_low, self.fleet.action_high
+        signals = {name: _estimate(critic) for name, critic in self.learner.critics.items()}
+        signals["judgement"] = lambda view: discrepancy(view.actions, self.actor.act(view.obs), low, high)
+        if classifier := self.learner.classifier:
+            signals["predicted_discrepancy"] = lambda view: classifier(view.obs)
+        return signals
+
+    def _execution(self, priority: Lexicographic) -> Execution | None:
+        """LazyDAgger injects noise, DAgger mixes; all others execute what the humans want."""
+        c, kinds = self.config, {type(term) for term in priority.terms}
+        if LazyDAgger in kinds and c.gate.noise:
+            noise = stream(c.seed, "injected noise")
+            return NoiseInjection(c.gate.noise, self.fleet.action_low, self.fleet.action_high, noise)
+        return BetaMixture(c.gate.beta, c.gate.epoch, stream(c.seed, "DAgger mixture")) if DAgger in kinds else None
 
 
 def assemble(config: RunConfig) -> Assembly:
@@ -79,7 +102,7 @@ def assemble(config: RunConfig) -> Assembly:
     find_task(config.task)
     config = _resolve_defaults(config)
     torch.set_num_threads(config.torch_threads or 1)
-    priority = parse(config.priority, config.thresholds)
+    priority = parse(config.priority, config.thresholds, config.gate)
     actor = _expert(config)
     fleet = make_fleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)
 
@@ -103,7 +126,13 @@ def assemble(config: RunConfig) -> Assembly:
                      stream(config.seed, f"critic/{name}"), derive(config.seed, f"critic/{name}/initial weights"))
         for name in sorted(priority.needs & {"risk", "goal"})
     }  # fmt: skip
-    learner = ImitationLearner(policy, dataset, config.learner, critics, config.seed)
+    classifier = None
+    if "predicted_discrepancy" in priority.needs:
+        classifier = DiscrepancyClassifier(
+            policy, dataset, stream(config.seed, "classifier"), derive(config.seed, "classifier/initial weights"),
+            beta_h=np.nan if config.gate.beta_h is None else config.gate.beta_h, batch=config.learner.batch,
+        )  # fmt: skip
+    learner = ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed)
     return Assembly(config, fleet, actor, policy, learner)
 
 
@@ -113,16 +142,28 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
     report("recording demonstrations", 0.0)
     obs, actions = demonstrations(c, assembly.actor, assembly.fleet.horizon)
     policy.set_normalisation(obs)
-    learner.dataset.add(obs, actions)
+    held_out = np.zeros(len(obs), dtype=bool)
+    if learner.classifier:  # 70 % for the policy, 30 % for the classifier (appendix A.1)
+        held_out[stream(c.seed, "held out").permutation(len(obs))[: round(0.3 * len(obs))]] = True
+        learner.classifier.held_out.add(obs[held_out], actions[held_out])
+    learner.dataset.add(obs[~held_out], actions[~held_out])
     _in_steps(c.learner.pretrain, learner.gradient_steps, "behaviour cloning", report)
 
-    if parse(c.priority).needs:
+    needs = parse(c.priority).needs
+    offline = discrepancy(policy.act(obs), actions, assembly.fleet.action_low, assembly.fleet.action_high)
+    if c.gate.beta_h is None:
+        c = dataclasses.replace(c, gate=dataclasses.replace(c.gate, beta_h=float(np.quantile(offline, 1 - c.gate.unsafe))))
+    if learner.classifier:
+        learner.classifier.beta_h = c.gate.beta_h or 0.0
+        learner.classifier.warn_if_blind()
+        _in_steps(c.learner.pretrain, learner.classifier.updates, "discrepancy classifier", report)
+    if needs & {"uncertainty", "risk", "goal"}:
         signals = _calibrate(assembly, report)
         for name, critic in learner.critics.items():
             _in_steps(c.critic.pretrain, critic.updates, f"{name} critic", report)
             signals[name] = np.concatenate([critic(o, a) for o, a in signals["visited"]])
-        assembly = dataclasses.replace(assembly, config=_resolve_thresholds(c, signals))
-    return assembly
+        c = _resolve_gate(_resolve_thresholds(c, signals), signals, offline)
+    return dataclasses.replace(assembly, config=c)
 
 
 def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Array, Array]:
@@ -181,6 +222,20 @@ def _resolve_thresholds(config: RunConfig, signals: dict[str, Any]) -> RunConfig
         if getattr(t, name) is None and name in signals
     }
     return dataclasses.replace(config, thresholds=dataclasses.replace(t, **found))
+
+
+def _resolve_gate(config: RunConfig, signals: dict[str, Any], offline: Array) -> RunConfig:
+    """The thresholds with which ThriftyDAgger begins (section 3.4), where they were not given as numbers."""
+    gate, q = config.gate, 1 - config.gate.alpha
+    risk = 1.0 - signals["goal"] if "goal" in signals else np.zeros(1)
+    found: dict[str, Any] = {
+        "novelty": float(np.quantile(signals["uncertainty"], q)),
+        "risk_ask": float(np.quantile(risk, q)),
+        "risk_cede": float(np.median(risk)),
+        "mean_discrepancy": float(offline.mean()),
+    }
+    missing = {name: value for name, value in found.items() if getattr(gate, name) is None}
+    return dataclasses.replace(config, gate=dataclasses.replace(gate, **missing))
 
 
 def _resolve_defaults(config: RunConfig) -> RunConfig:

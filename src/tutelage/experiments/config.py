@@ -15,6 +15,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from tutelage.errors import ConfigError, RunFolderError
+from tutelage.fleet.gates import GateConfig
 from tutelage.fleet.priority import PriorityConfig
 from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
@@ -45,6 +46,7 @@ class RunConfig:
         calibration_steps: timesteps that the cloned policy runs alone before the run; from them come the thresholds
             and the first data of the critics (appendix C.3: about 20,000 transitions).
         thresholds: of the priority function.
+        gate: numbers of the gates (SafeDAgger, LazyDAgger and the others).
         learner: the update schedule.
         critic: of the risk and goal critics.
         members: networks in the ensemble.
@@ -77,6 +79,7 @@ class RunConfig:
     offline_disturbance: str = "none"
     calibration_steps: int = 200
     thresholds: PriorityConfig = field(default_factory=PriorityConfig)
+    gate: GateConfig = field(default_factory=GateConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     critic: CriticConfig = field(default_factory=CriticConfig)
     members: int = 5

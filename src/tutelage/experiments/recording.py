@@ -105,9 +105,9 @@ class MetricsFile:
 class EpisodeFrames:
     """`episodes/*.parquet`: frames in the field's names, one file between two checkpoints.
 
-    Columns: timestep, robot, episode_index, frame_index, observation.state, action (executed), action.proposed,
-    next.reward, next.success, next.violation, intervention (bool), operator (human, -1 for none), policy_version (number
-    of timesteps the policy has learned from).
+    Columns: timestep, robot, episode_index, frame_index, observation.state, action (executed), action.proposed (by the
+    policy), action.wanted (by the human; the executed one where none acted), next.reward, next.success, next.violation,
+    intervention (bool), operator (human, -1 for none), policy_version (number of timesteps the policy has learned from).
     """
 
     def __init__(self, folder: Path, which: str, robots: int) -> None:
@@ -137,6 +137,7 @@ class EpisodeFrames:
                 "observation.state": step.obs[robots].astype(np.float32),
                 "action": step.actions[robots],
                 "action.proposed": step.proposed[robots].astype(np.float32),
+                "action.wanted": np.where(human[:, None], step.wanted, step.actions)[robots],
                 "next.reward": step.reward[robots],
                 "next.success": step.success[robots],
                 "next.violation": step.violation[robots],

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tutelage.errors import ConfigError
 from tutelage.fleet.modes import MOVING, Mode
 from tutelage.fleet.step import Step
+from tutelage.learning.classifier import DiscrepancyClassifier
 from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
@@ -59,6 +60,7 @@ class ImitationLearner:
         dataset: D, with the offline data already in it.
         config: the schedule.
         critics: by the name of the signal they estimate: "risk" or "goal".
+        classifier: f of SafeDAgger, updated whenever the policy is.
         seed: root seed, for new initial weights.
     """
 
@@ -68,10 +70,11 @@ class ImitationLearner:
         dataset: AggregatedDataset,
         config: LearnerConfig,
         critics: dict[str, Critic] | None = None,
+        classifier: DiscrepancyClassifier | None = None,
         seed: int = 0,
     ) -> None:
         self.policy, self.dataset, self.config, self.seed = policy, dataset, config, seed
-        self.critics = critics or {}
+        self.critics, self.classifier = critics or {}, classifier
         self.optimiser = adam(policy.parameters(), config.learning_rate)
         self.restarts, self._episode_ended = 0, False
 
@@ -128,6 +131,8 @@ class ImitationLearner:
             if c.schedule == "scratch":
                 self.restart()
             losses["policy"] = self.gradient_steps(c.gradient_steps)
+            if self.classifier:
+                losses["classifier"] = self.classifier.updates(c.gradient_steps)
         for name, critic in self.critics.items():
             if c.schedule != "never" and (t + 1) % critic.config.every == 0:
                 losses[name] = critic.update()
@@ -139,6 +144,7 @@ class ImitationLearner:
             "adam": optimiser_state(self.optimiser),
             "dataset": self.dataset.state_dict(),
             "critics": {name: critic.state_dict() for name, critic in self.critics.items()},
+            **({"classifier": self.classifier.state_dict()} if self.classifier else {}),
             "restarts": self.restarts,
             "episode_ended": self._episode_ended,
         }
@@ -150,4 +156,6 @@ class ImitationLearner:
         self.dataset.load_state_dict(state["dataset"])
         for name, critic in self.critics.items():
             critic.load_state_dict(state["critics"][name])
+        if self.classifier:
+            self.classifier.load_state_dict(state["classifier"])
         self.restarts, self._episode_ended = state["restarts"], state["episode_ended"]
