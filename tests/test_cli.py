@@ -22,6 +22,7 @@ from tutelage.experiments.config import RunConfig
 from tutelage.experiments.recording import lock
 from tutelage.experiments.run import Run
 from tutelage.experiments.train_expert import ExpertConfig
+from tutelage.fleet.gates import GATES
 from tutelage.policies.expert import GaussianActor
 
 pytest.importorskip("mujoco")
@@ -124,7 +125,7 @@ def test_info(tut: Callable[..., Said]) -> None:
         "level", "none", "mild", "light", "moderate", "strong", "severe", "extreme",
     ]  # fmt: skip
     priorities = tut("info", "priorities").out
-    assert [line.split()[0] for line in priorities.splitlines()] == ["term", "C", "U", "R", "G", "Random", "U.G"]
+    assert [line.split()[0] for line in priorities.splitlines()] == ["term", "C", "U", "R", "G", "Random", "U.G", *GATES]
     assert "1 for robots in violation, 0 for the others" in priorities
     version = tut("info", "version").out
     assert f"tutelage {tutelage.__version__}" in version
@@ -259,7 +260,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["run", "Walker2d", "--thresholds.risk-quantile", "1.5"], "risk_quantile must be between 0 and 1, got 1.5"),
         (
             ["run", "Walker2d", "--priority", "C.X."],
-            "cannot read the priority 'C.X.': use different terms of C, U, R, G, Random with dots, such as C.U.R.",
+            "cannot read the priority 'C.X.': use different terms of C, U, R, G, Random with dots, such as C.U.R., *",
         ),
         (
             ["run", "Walker2d", "--disturbance", "awful"],

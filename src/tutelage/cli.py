@@ -170,12 +170,13 @@ def info(what: Positional[Literal["tasks", "levels", "priorities", "version"]] =
         rows = [[name, *(f"{value:g}" for value in asdict(level).values())] for name, level in LEVELS.items()]
         _print_table(["level", *asdict(LEVELS["none"])], rows)
     elif what == "priorities":
+        from tutelage.fleet.gates import GATES
         from tutelage.fleet.priority import TERMS, UncertaintyGoal
 
         terms = {**TERMS, "U.G": UncertaintyGoal}
-        _print_table(
-            ["term", "meaning"], [[n, (t.__doc__ or "").split(": ", 1)[-1].splitlines()[0]] for n, t in terms.items()]
-        )
+        rows = [[name, (term.__doc__ or "").split(": ", 1)[-1].splitlines()[0]] for name, term in terms.items()]
+        rows += [[name, (gate.__doc__ or "").splitlines()[0]] for name, gate in GATES.items()]
+        _print_table(["term", "meaning"], rows)
     else:
         from tutelage.envs.mujoco_fleet import MujocoFleet
         from tutelage.envs.tasks import TASKS

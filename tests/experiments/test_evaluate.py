@@ -14,6 +14,7 @@ from small import contents, points, walker
 from tutelage.errors import ConfigError, RunFolderError, TutelageError
 from tutelage.experiments.evaluate import evaluate_policy, evaluate_run
 from tutelage.experiments.run import Run
+from tutelage.fleet.gates import GateConfig
 from tutelage.fleet.priority import PriorityConfig
 from tutelage.policies.expert import GaussianActor
 
@@ -60,6 +61,19 @@ def test_help_is_given_when_the_priority_asks_for_it(folder: Path) -> None:
     assert evaluate_run(folder, 40, "U.C.")["teleoperation"] > 0
 
 
+def test_help_by_what_the_run_has_learned(folder: Path) -> None:
+    assert evaluate_run(folder, 40, "C.U.R.")["teleoperation"] > 0
+
+
+def test_execution_mode_is_a_gate_without_learning_and_without_noise(tmp_path: Path) -> None:
+    gate = GateConfig(unsafe=0.7, noise=0.5)
+    run = Run.start(points(tmp_path / "run", priority="LazyDAgger", gate=gate, offline_pairs=200, t_teleop=1))
+    run.run()
+    before = contents(run.folder)["weights"]
+    assert evaluate_run(run.folder, 40, "LazyDAgger")["teleoperation"] > 0
+    assert contents(run.folder)["weights"] == before
+
+
 def test_a_policy_that_is_evaluated_does_not_learn(folder: Path) -> None:
     weights = contents(folder)["weights"]
     evaluate_run(folder, 20, "U.C.")
@@ -69,7 +83,7 @@ def test_a_policy_that_is_evaluated_does_not_learn(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"priority": "C.U.R."}, r"this run has no signal 'risk' \(it has: uncertainty\); choose a priority without it"),
+        ({"priority": "SafeDAgger"}, "this run did not learn predicted_discrepancy, which SafeDAgger looks at"),
         ({"priority": "U.C.", "expert": True}, "this run has no signal 'uncertainty'"),
         ({"priority": "X"}, "cannot read the priority 'X'"),
         ({"steps": 0}, "steps must be at least 1, got 0"),

@@ -37,7 +37,11 @@ class StopAt:
 
 
 def gated(out: Path, name: str, **changes: Any) -> Any:
-    gate = GateConfig(without="risk", alpha=0.3) if name == "ThriftyDAgger" else GateConfig(unsafe=0.7, noise=0.1, beta=0.5, epoch=5)
+    gate = (
+        GateConfig(without="risk", alpha=0.3)
+        if name == "ThriftyDAgger"
+        else GateConfig(unsafe=0.7, noise=0.1, beta=0.5, epoch=5)
+    )
     return points(out, **{"priority": name, "gate": gate, "t_teleop": 1, "offline_pairs": 200, **changes})
 
 

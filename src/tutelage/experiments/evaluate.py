@@ -11,13 +11,16 @@ from typing import Any
 from tutelage.errors import ConfigError
 from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
-from tutelage.experiments.run import read_config
+from tutelage.experiments.run import learner_state, read_config
 from tutelage.fleet.metrics import Counting, Tally
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import Uncertainty, parse
 from tutelage.fleet.step import Subscriber
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.store import write_atomic
+
+LEARNED = {"risk", "goal", "predicted_discrepancy"}
+"""Signals of the learner's critics and classifier. A run folder has those that its own priority looks at."""
 
 
 def evaluate_policy(
@@ -26,6 +29,7 @@ def evaluate_policy(
     priority: str = "C.",
     tally: Tally | None = None,
     subscribers: Sequence[Subscriber] = (),
+    learner: dict[str, Any] | None = None,
 ) -> dict[str, float]:
     """Run a frozen policy for `config.steps` timesteps; returns the metrics.
 
@@ -36,12 +40,25 @@ def evaluate_policy(
             need a policy that has them.
         tally: where to count, for a display that watches it.
         subscribers: listeners, such as a progress display.
+        learner: the state of the run's learner, for priorities that look at its critics or its classifier.
+
+    Raises:
+        ConfigError: the priority looks at something that this run has not learned.
     """
     # The period t_I without hard resets belongs to the beginning of learning.
     thresholds = dataclasses.replace(config.thresholds, initial=0)
     if thresholds.uncertainty is None and any(isinstance(term, Uncertainty) for term in parse(priority, thresholds).terms):
         raise ConfigError(f"this run has no threshold of uncertainty, which {priority} needs; choose C. or Random.")
     assembly = assemble(dataclasses.replace(config, priority=priority, thresholds=thresholds))
+    wanted = LEARNED & parse(priority, thresholds).needs
+    if wanted and policy is not None:
+        try:
+            assembly.learner.load_state_dict(learner or {})
+        except KeyError:
+            raise ConfigError(
+                f"this run did not learn {', '.join(sorted(wanted))}, which {priority} looks at; evaluate it with "
+                f"{config.priority}, U.C. or C."
+            ) from None
     tally = tally or Tally(config.robots, config.humans)
     loop = assembly.loop(frozen=assembly.actor if policy is None else policy)
     loop.subscribers = [Counting(tally), *subscribers]
@@ -65,7 +82,8 @@ def evaluate_run(
     """
     config = dataclasses.replace(read_config(folder), steps=steps)
     policy = None if expert else EnsemblePolicy.load(folder / "policy.safetensors")[0]
-    metrics = evaluate_policy(config, policy, priority, tally, subscribers)
+    learner = learner_state(folder) if LEARNED & parse(priority).needs and not expert else None
+    metrics = evaluate_policy(config, policy, priority, tally, subscribers, learner)
     result = {"steps": steps, "priority": priority, "policy": "expert" if expert else "run", **metrics}
     write_atomic(evaluation_path(folder, expert), json.dumps(result, indent=2).encode())
     return result

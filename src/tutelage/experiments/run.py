@@ -27,9 +27,14 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, recorder: Recorder, assembly: Assembly) -> None:
-        self.path = folder / "checkpoint" / "state.safetensors"
+        self.path = self.path_in(folder)
         self._folder, self._recorder, self._assembly = folder, recorder, assembly
         self._complete = -1
+
+    @staticmethod
+    def path_in(folder: Path) -> Path:
+        """The checkpoint of a run folder."""
+        return folder / "checkpoint" / "state.safetensors"
 
     def on_start(self, loop: Loop) -> None:
         """Nothing to do: a run that starts or resumes has its checkpoint."""
@@ -160,6 +165,24 @@ def read_config(folder: Path) -> RunConfig:
     values.pop("version", None)
     values.pop("algorithm", None)
     return from_json(RunConfig, values)  # type: ignore[no-any-return]
+
+
+def learner_state(folder: Path) -> dict[str, Any]:
+    """What the learner of a run knew at its last checkpoint.
+
+    Raises:
+        RunFolderError: a damaged checkpoint, or one of another version.
+    """
+    path = Checkpoints.path_in(folder)
+    state = load_tree(path)
+    if state.get("format") != FORMAT:
+        raise RunFolderError(
+            f"{path} has format {state.get('format')}, this version reads {FORMAT}; use the version that wrote it"
+        )
+    try:
+        return dict(state["loop"]["learner"])
+    except (LookupError, TypeError):
+        raise RunFolderError(f"{path} is damaged; restore it") from None
 
 
 def environment() -> str:

@@ -32,8 +32,10 @@ class GateConfig:
         noise: sigma^2 that LazyDAgger injects into the human's actions, in units of half the action range; 0: (-Noise).
         alpha: alpha_h of ThriftyDAgger: the desired fraction of timesteps with a request. In (0, 1).
         without: a signal that ThriftyDAgger is to do without, "novelty" or "risk" (its two ablations).
-        novelty, risk_ask, risk_cede, mean_discrepancy: delta_h, beta_H, beta_R and delta_r with which ThriftyDAgger begins;
-            None: from the first steps of the cloned policy.
+        novelty: delta_h with which ThriftyDAgger begins; None: from the first steps of the cloned policy.
+        risk_ask: likewise beta_H.
+        risk_cede: likewise beta_R.
+        mean_discrepancy: likewise delta_r; None: from the offline data.
         history: timesteps of robots seen before ThriftyDAgger recomputes its thresholds.
         doubt: chi of EnsembleDAgger: uncertainty above it asks; None: like u-hat of the thresholds.
         reaction: timesteps that HG-DAgger's human needs to make up their mind, either way.
