@@ -252,7 +252,7 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
     if config.torch_threads is None:
         changes["torch_threads"] = 1 if config.overlap else default_torch_threads()
-    if config.threads is None and config.overlap:
+    if config.threads is None and config.overlap and task:
         changes["threads"] = max(1, available_cores() - 1)  # the last core learns
     if set(config.priority.split(".")) <= {"C", ""}:
         # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).
