@@ -15,9 +15,9 @@ import numpy as np
 from tutelage.errors import MissingExtraError, RunFolderError, TutelageError
 from tutelage.fleet.events import Events
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.metrics import Tally
 from tutelage.fleet.modes import MOVING, Mode
 from tutelage.fleet.step import Step
+from tutelage.fleet.tally import Tally
 from tutelage.store import write_atomic
 
 
