@@ -199,3 +199,33 @@ def make_loop(
     """A loop with `humans` alike supervisors, and a policy that stands still unless another one is given."""
     team = Team([supervisor or FakeSupervisor()] * humans, latency)
     return Loop(fleet, rest.pop("policy", FakePolicy()), priority, team, **rest)
+
+
+class Good(PointFleet):
+    """A seed restarts everything; falls, arrivals and the horizon occur under random actions."""
+
+    def __init__(self, num_envs: int = 4) -> None:
+        super().__init__(num_envs, bound=0.3, goal=0.25, horizon=15, noise=0.05, start=0.1)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is not None:
+            self.t, self.obs = 0, self.obs.copy()
+            self.obs[:, EPISODE] = -1
+        return super().reset(seed=seed, options=options)
+
+
+def right(obs: Any) -> Any:
+    """Commands (N, 1) of the observations (N, 4), as they should be."""
+    return np.tanh(obs[:, :1]).astype(np.float32)
+
+
+def scribble(obs: Any) -> Any:
+    """The same, but it spoils the observations."""
+    obs += 1.0
+    return right(obs)
+
+
+def count(calls: list[int]) -> Any:
+    """Another number at every call."""
+    calls.append(1)
+    return len(calls) * 0.1
