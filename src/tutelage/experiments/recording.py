@@ -213,9 +213,13 @@ class Recorder:
         self.losses |= step.losses
         if self.frames:
             self.frames.add(step)
-        if loop.t % self.every == 0 or loop.t == self.steps:
+        if self.due(loop.t):
             self.metrics.write(self.row())
             self.events.commit()  # a report of a live run sees both
+
+    def due(self, t: int) -> bool:
+        """Whether a line of metrics is written after t timesteps."""
+        return t % self.every == 0 or t == self.steps
 
     def row(self) -> dict[str, float]:
         """The metrics so far and the latest losses."""
