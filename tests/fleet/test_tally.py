@@ -65,3 +65,13 @@ def test_the_tally_of_a_running_loop_is_the_summary_of_its_log(seed: int, latenc
     spans = metrics.intervals(log)
     (over,) = np.nonzero((spans.mode == Mode.RESETTING) & (spans.end < steps))
     assert (spans.length[over] == 2).all()  # a hard reset takes t_R timesteps
+
+
+def test_a_checkpoint_that_is_older_than_an_event_can_be_continued() -> None:
+    tally = Tally(2, 1)
+    tally.events[:] = np.arange(len(Event))
+    state = tally.state_dict()
+    state["events"] = state["events"][:-1]
+    again = Tally(2, 1)
+    again.load_state_dict(state)
+    assert again.events.tolist() == [*range(len(Event) - 1), 0]

@@ -85,8 +85,9 @@ class Tally:
         """Restore what `state_dict` returned."""
         for name in ("t", "reward", "idle_time", "switches_to_robot"):
             setattr(self, name, state[name])
-        for name in ("events", "time"):
-            setattr(self, name, state[name].copy())
+        self.events[:] = 0
+        self.events[: len(state["events"])] = state["events"]  # a checkpoint that is older than an event does not count it
+        self.time = state["time"].copy()
         self._mode, self._broken = state["mode"].copy(), state["broken"].copy()
 
 
