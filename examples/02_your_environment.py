@@ -9,9 +9,9 @@ from tutelage.checks import check_env
 from tutelage.envs.gymnasium_fleet import GymnasiumFleet, Outcome
 from tutelage.fleet.allocation import FleetDAgger
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.metrics import Counting, Tally
 from tutelage.fleet.priority import PriorityConfig, parse
 from tutelage.fleet.supervisor import PolicySupervisor, Team
+from tutelage.fleet.tally import Counting, Tally
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.imitation import ImitationLearner, LearnerConfig
 from tutelage.policies.ensemble import EnsemblePolicy

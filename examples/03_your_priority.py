@@ -12,9 +12,9 @@ from tutelage.envs.registry import make_fleet
 from tutelage.experiments.assemble import assemble, prepare
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.metrics import Counting, Tally
 from tutelage.fleet.priority import Priority, parse
 from tutelage.fleet.supervisor import PolicySupervisor, Team
+from tutelage.fleet.tally import Counting, Tally
 from tutelage.fleet.view import FleetView
 from tutelage.learning.imitation import LearnerConfig
 

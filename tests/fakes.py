@@ -214,3 +214,33 @@ def make_view(
         np.full((n, 1), np.nan), differs, new, humans, np.random.default_rng(seed),
         {name: (lambda view, value=value: np.array(value)) for name, value in signals.items()},
     )  # fmt: skip
+
+
+class Good(PointFleet):
+    """A seed restarts everything; falls, arrivals and the horizon occur under random actions."""
+
+    def __init__(self, num_envs: int = 4) -> None:
+        super().__init__(num_envs, bound=0.3, goal=0.25, horizon=15, noise=0.05, start=0.1)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is not None:
+            self.t, self.obs = 0, self.obs.copy()
+            self.obs[:, EPISODE] = -1
+        return super().reset(seed=seed, options=options)
+
+
+def right(obs: Any) -> Any:
+    """Commands (N, 1) of the observations (N, 4), as they should be."""
+    return np.tanh(obs[:, :1]).astype(np.float32)
+
+
+def scribble(obs: Any) -> Any:
+    """The same, but it spoils the observations."""
+    obs += 1.0
+    return right(obs)
+
+
+def count(calls: list[int]) -> Any:
+    """Another number at every call."""
+    calls.append(1)
+    return len(calls) * 0.1

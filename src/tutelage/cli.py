@@ -89,7 +89,7 @@ def evaluate(
     from tutelage.experiments.evaluate import evaluate_run
     from tutelage.experiments.progress import ProgressDisplay
     from tutelage.experiments.run import read_config
-    from tutelage.fleet.metrics import Tally
+    from tutelage.fleet.tally import Tally
 
     config = read_config(folder)
     tally = Tally(config.robots, config.humans)

@@ -22,7 +22,7 @@ from tutelage.errors import RunFolderError
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.live import LivePlots
 from tutelage.experiments.recording import lock
-from tutelage.experiments.run import Run
+from tutelage.experiments.run import Checkpoints, Run
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.step import Step
 from tutelage.store import load_tree
@@ -311,6 +311,19 @@ def test_a_run_stopped_between_checkpoints_keeps_its_last_timestep(whole: Path, 
         assert run.loop.t == t
     assert resume(folder) == 18
     assert_same(whole, folder)
+
+
+@pytest.mark.parametrize(("steps", "saves"), [(30, [0, 10, 20, 30]), (25, [0, 10, 20, 25])])
+def test_a_state_is_saved_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int, saves: list[int]) -> None:
+    saved, save = [], Checkpoints.save
+
+    def count(self: Checkpoints, loop: Loop) -> None:
+        saved.append(loop.t)
+        save(self, loop)
+
+    monkeypatch.setattr(Checkpoints, "save", count)
+    Run.start(points(tmp_path / "run", steps=steps)).run()
+    assert saved == saves
 
 
 def test_pictures_that_cannot_be_drawn_do_not_end_a_run_or_lose_its_end(tmp_path: Path) -> None:

@@ -243,6 +243,16 @@ def test_latency_needs_a_fleet_that_can_pause_and_that_is_said_first(
         Run.start(points(tmp_path / "run", latency=1))
 
 
+def test_a_fleet_that_cannot_be_saved_is_refused_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fakes import PointFleet
+
+    monkeypatch.setattr(PointFleet, "can_checkpoint", False)
+    monkeypatch.setattr(assembling, "demonstrations", lambda *args: pytest.fail("minutes are spent"))
+    with pytest.raises(ConfigError, match="small:point_fleet cannot be checkpointed, and a run must be"):
+        Run.start(points(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_folder_that_holds_a_run_is_never_overwritten(tmp_path: Path) -> None:
     run = Run.start(points(tmp_path / "run"))
     run.run()

@@ -21,8 +21,8 @@ from tutelage.experiments.evaluate import evaluate_run
 from tutelage.experiments.run import Run
 from tutelage.experiments.study import ABLATIONS, BEHAVIOUR_CLONING, StudyConfig, configurations, random_threshold, run_study
 from tutelage.fleet.allocation import FleetDAgger
-from tutelage.fleet.metrics import Counting, Tally
 from tutelage.fleet.priority import PriorityConfig, parse
+from tutelage.fleet.tally import Counting, Tally
 
 pytest.importorskip("mujoco")
 pytest.importorskip("pyarrow")

@@ -550,7 +550,7 @@ def full_loop(seed: int, text: str, schedule: Any, overlap: bool):
     }  # fmt: skip
     learner = ImitationLearner(
         policy, AggregatedDataset((4,), 1, 3, default_rng(seed + 3)),
-        LearnerConfig(schedule=schedule, every=3, gradient_steps=2, batch=8, learning_rate=1e-2), critics, seed,
+        LearnerConfig(schedule=schedule, every=3, gradient_steps=2, batch=8, learning_rate=1e-2), critics, seed=seed,
     )  # fmt: skip
     human = NoisySupervisor(PolicySupervisor(FakePolicy(-0.3)), 0.2, default_rng(seed + 4))
     config = PriorityConfig(uncertainty=1e-4, risk=0.1, combined=0.5, random=0.6, initial=5)

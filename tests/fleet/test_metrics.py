@@ -1,4 +1,4 @@
-"""The metrics: worked by hand on a small log, against a brute-force replay, and against the live tally."""
+"""The metrics: worked by hand on a small log, and against a brute-force replay."""
 
 from __future__ import annotations
 
@@ -7,28 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import PointFleet, make_loop
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from walks import Row, logs, make_log, replay
 
 from tutelage.errors import ContractError
 from tutelage.fleet import metrics
-from tutelage.fleet.allocation import FleetDAgger
-from tutelage.fleet.events import Events
-from tutelage.fleet.metrics import EventLog, Tally
-from tutelage.fleet.modes import END_OF_STEP, HELPED, INVALID, TABLE, Event, Mode
-from tutelage.fleet.priority import parse
-from tutelage.fleet.step import Step
+from tutelage.fleet.metrics import EventLog
+from tutelage.fleet.modes import HELPED, Event, Mode
 
-Array = NDArray[Any]
-Row = tuple[int, int, int, Event, Mode]
 A, S, T, V, R, O = Mode  # noqa: E741 - as in the table of modes
-
-
-def make_log(rows: list[Row], robots: int, humans: int, steps: int) -> EventLog:
-    columns = np.array(rows, dtype=np.int64).reshape(-1, 5).T
-    return EventLog(Events(*columns), robots, humans, steps)
 
 
 # N = 3 robots, M = 2 humans, T = 12 timesteps; switching latency 1 for the reset of robot 1, none elsewhere.
@@ -185,42 +173,6 @@ def test_impossible_logs_are_refused(rows: list[Row], message: str) -> None:
 # -- against a replay of single steps -----------------------------------------------------------------------------------
 
 
-@st.composite
-def logs(draw: st.DrawFn) -> EventLog:
-    """Random walks through the table of modes: several events a step, before it and at its end."""
-    robots, humans, steps = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(0, 12))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    mode = [A] * robots
-    rows: list[Row] = []
-    for t in range(steps):
-        for late in (False, True):
-            for robot in rng.permutation(robots):
-                for _ in range(rng.integers(0, 2 if late else 4)):
-                    possible = [e for e in Event if TABLE[mode[robot], e] != INVALID and (e in END_OF_STEP) == late]
-                    if possible:
-                        event = possible[rng.integers(len(possible))]
-                        mode[robot] = Mode(TABLE[mode[robot], event])
-                        rows.append((t, int(robot), int(rng.integers(-1, humans)), event, mode[robot]))
-    return make_log(rows, robots, humans, steps)
-
-
-def replay(log: EventLog) -> tuple[Array, Array]:
-    """The mode and the violation of each robot during each step, (T, N), one event at a time."""
-    rows = list(zip(*(column.tolist() for column in log.events), strict=True))
-    mode, violated = [A] * log.num_robots, [False] * log.num_robots
-    modes, broken = np.empty((log.steps, log.num_robots), int), np.empty((log.steps, log.num_robots), bool)
-    for t in range(log.steps):
-        for late in (False, True):
-            if late:
-                modes[t], broken[t] = mode, violated
-            for when, robot, _, event, after in rows:
-                if when == t and (event in END_OF_STEP) == late:
-                    mode[robot] = Mode(after)
-                    # c(s) = 1 begins with a violation; resets, and all that leads back to autonomy, end it
-                    violated[robot] = after in (V, R) or (after == S and violated[robot])
-    return modes, broken
-
-
 @given(logs())
 @settings(max_examples=150, deadline=None)
 def test_metrics_agree_with_a_replay(log: EventLog) -> None:
@@ -258,57 +210,3 @@ def test_curves_are_the_metrics_of_the_log_until_then(log: EventLog, steps: int)
     ):
         assert curve(log).shape == (log.steps,)
         assert total(early) == pytest.approx(curve(log)[steps - 1] if steps else 0)
-
-
-def replayed_steps(log: EventLog) -> list[Step]:
-    """The log as the steps of a loop, with a reward of 1 for each success."""
-    modes, _ = replay(log)
-    nothing = np.empty(0)
-    result = []
-    for t in range(log.steps):
-        events = Events(*(column[log.events.t == t] for column in log.events))
-        reward = np.bincount(events.of(Event.SUCCESS).robot, minlength=log.num_robots).astype(np.float64)
-        result.append(
-            Step(
-                t, nothing, nothing, nothing, nothing, modes[t], nothing, reward, nothing, nothing, nothing, nothing, events
-            )
-        )
-    return result
-
-
-@given(logs())
-@settings(max_examples=100, deadline=None)
-def test_the_tally_of_any_walk_through_the_modes_is_the_summary_of_its_log(log: EventLog) -> None:
-    tally = Tally(log.num_robots, log.num_humans)
-    for step in replayed_steps(log):
-        tally.update(step)
-    assert tally.summary() == {**metrics.summary(log), "reward": metrics.successes(log)}
-
-
-# -- against the loop -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("latency", [0, 2])
-def test_the_tally_of_a_running_loop_is_the_summary_of_its_log(seed: int, latency: int) -> None:
-    robots, humans, steps = 7, 3, 80
-    fleet = PointFleet(robots, noise=0.3, goal=0.4, bound=0.6, horizon=6)  # chance decides who falls, arrives, runs late
-    allocator = FleetDAgger(t_teleop=3, t_reset=2)
-    loop = make_loop(fleet, parse("C.Random."), humans, latency=latency, allocator=allocator, seed=seed)
-    tally, parts, reward, helped = Tally(robots, humans), [], 0.0, 0
-    for t in range(steps):
-        if t == steps // 2:  # as in a resumed run
-            state, tally = tally.state_dict(), Tally(robots, humans)
-            tally.load_state_dict(state)
-        step = loop.step()
-        tally.update(step)
-        parts.append(step.events)
-        reward += step.reward.sum()
-        helped += np.count_nonzero(step.human >= 0)
-        log = EventLog(Events.concatenate(parts), robots, humans, t + 1)
-        assert tally.summary() == {**metrics.summary(log), "reward": pytest.approx(reward)}
-    assert metrics.human_time(log).total == helped  # alpha as the loop sees it
-    assert min(tally.summary()[key] for key in ("successes", "hard_resets", "timeouts", "switches_to_robot")) > 0
-    spans = metrics.intervals(log)
-    (over,) = np.nonzero((spans.mode == Mode.RESETTING) & (spans.end < steps))
-    assert (spans.length[over] == 2).all()  # a hard reset takes t_R timesteps

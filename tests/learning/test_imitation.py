@@ -30,7 +30,7 @@ def make(critics=(), seed: int = 0, **config) -> ImitationLearner:
     kind = {"risk": "bad", "goal": "good"}
     build = {name: Critic(WIDTH, 1, kind[name], policy, critic_config, scale, default_rng(seed), seed) for name in critics}
     dataset = AggregatedDataset((WIDTH,), 1, 3, default_rng(seed))
-    return ImitationLearner(policy, dataset, LearnerConfig(**{"batch": 8, **config}), build, seed)
+    return ImitationLearner(policy, dataset, LearnerConfig(**{"batch": 8, **config}), build, seed=seed)
 
 
 def step(modes, *, t: int = 0, **masks) -> Step:

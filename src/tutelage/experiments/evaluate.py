@@ -12,10 +12,10 @@ from tutelage.errors import ConfigError
 from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.run import learner_state, read_config
-from tutelage.fleet.metrics import Counting, Tally
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import Uncertainty, parse
 from tutelage.fleet.step import Subscriber
+from tutelage.fleet.tally import Counting, Tally
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.store import write_atomic
 

@@ -2,8 +2,7 @@
 
     python -m tutelage.experiments.levels Walker2d
 
-A level suits a comparison of interactive learners when the expert succeeds in more than 90 % of the episodes and behaviour
-cloning on the offline data in less than 20 %: then help is possible, and needed. Of the levels that suit, a
+A level suits a comparison of interactive learners when help is possible and needed (`suits`). Of the levels that suit, a
 task has the strongest. Measured on a seed that no comparison uses.
 """
 
@@ -48,6 +47,16 @@ class LevelsConfig:
     results: Path = Path("results/levels.json")
 
 
+def suits(expert_success: float, cloned_success: float) -> bool:
+    """The rule: the expert succeeds in more than 90 % of the episodes, behaviour cloning in less than 20 %.
+
+    Args:
+        expert_success: fraction of episodes, 0 to 1: help is possible.
+        cloned_success: likewise, of the policy with which a run begins: help is needed.
+    """
+    return expert_success > 0.9 and cloned_success < 0.2
+
+
 def behaviour_cloning(config: LevelsConfig, level: str) -> dict[str, float]:
     """Success and survival of the policy with which a run begins, over one episode on each robot."""
     run = RunConfig(
@@ -79,7 +88,7 @@ def measure(config: LevelsConfig) -> list[dict[str, object]]:
     for level in config.levels or (own.disturbance,):
         expert = experts.evaluate(actor, config.task, level, config.episodes, config.seed, config.threads)
         cloned = behaviour_cloning(config, level)
-        suits = expert.success > 0.9 and cloned["success"] < 0.2
+        fits = suits(expert.success, cloned["success"])
         rows.append(
             {
                 "level": level,
@@ -91,13 +100,13 @@ def measure(config: LevelsConfig) -> list[dict[str, object]]:
                 "offline_pairs": pairs,
                 "episodes": config.episodes,
                 "seed": config.seed,
-                "suits": suits,
+                "suits": fits,
             }
         )
         print(
             f"{config.task} at {level}: the expert succeeds in {expert.success:.0%}, behaviour cloning in "
             f"{cloned['success']:.0%} (survives {cloned['survived']:.0%}): "
-            f"{'suits' if suits else 'does not suit'} a comparison",
+            f"{'suits' if fits else 'does not suit'} a comparison",
             flush=True,
         )
     return rows

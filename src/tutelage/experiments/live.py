@@ -76,7 +76,7 @@ class TensorBoard:
 
     def on_step(self, loop: Loop, step: Step) -> None:
         """Write what the recorder writes, when it does."""
-        if loop.t % self._recorder.every == 0 or loop.t == self._recorder.steps:
+        if self._recorder.due(loop.t):
             for name, value in self._recorder.row().items():
                 self._writer.add_scalar(name, value, loop.t)
 

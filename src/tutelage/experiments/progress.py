@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.metrics import Tally
 from tutelage.fleet.step import Step
+from tutelage.fleet.tally import Tally
 
 
 class ProgressDisplay:

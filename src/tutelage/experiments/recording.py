@@ -15,9 +15,9 @@ import numpy as np
 from tutelage.errors import MissingExtraError, RunFolderError, TutelageError
 from tutelage.fleet.events import Events
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.metrics import Tally
 from tutelage.fleet.modes import MOVING, Mode
 from tutelage.fleet.step import Step
+from tutelage.fleet.tally import Tally
 from tutelage.store import write_atomic
 
 
@@ -214,9 +214,13 @@ class Recorder:
         self.losses |= step.losses
         if self.frames:
             self.frames.add(step)
-        if loop.t % self.every == 0 or loop.t == self.steps:
+        if self.due(loop.t):
             self.metrics.write(self.row())
             self.events.commit()  # a report of a live run sees both
+
+    def due(self, t: int) -> bool:
+        """Whether a line of metrics is written after t timesteps."""
+        return t % self.every == 0 or t == self.steps
 
     def row(self) -> dict[str, float]:
         """The metrics so far and the latest losses."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import tutelage
-from tutelage.errors import ContractError, RunFolderError
+from tutelage.errors import ConfigError, ContractError, RunFolderError
 from tutelage.experiments.assemble import Assembly, assemble, prepare
 from tutelage.experiments.config import FORMAT, RunConfig, from_json, to_json
 from tutelage.experiments.recording import Recorder, lock
@@ -29,7 +29,7 @@ class Checkpoints:
     def __init__(self, folder: Path, recorder: Recorder, assembly: Assembly) -> None:
         self.path = self.path_in(folder)
         self._folder, self._recorder, self._assembly = folder, recorder, assembly
-        self._complete = -1
+        self._complete = self._saved = -1
 
     @staticmethod
     def path_in(folder: Path) -> Path:
@@ -47,8 +47,11 @@ class Checkpoints:
             self.save(loop)
 
     def on_end(self, loop: Loop) -> None:
-        """Save where the run ended, unless it broke in the middle of a step: then the last checkpoint is the truth."""
-        if not loop.in_step and self._complete == loop.t:
+        """Save where the run ended, if that is not saved yet.
+
+        Unless it broke in the middle of a step: then the last checkpoint is the truth.
+        """
+        if not loop.in_step and self._complete == loop.t != self._saved:
             self.save(loop)
 
     def save(self, loop: Loop) -> None:
@@ -58,6 +61,7 @@ class Checkpoints:
         self._assembly.policy.save(self._folder / "policy.safetensors", card)
         # The checkpoint last: a run that it calls complete has its last policy.
         save_tree(self.path, {"format": FORMAT, "loop": loop.state_dict(), "recorder": self._recorder.state_dict()})
+        self._saved = loop.t
 
     def load(self, loop: Loop) -> None:
         """Continue from the checkpoint: restore the state, cut the recordings back to it."""
@@ -95,12 +99,14 @@ class Run:
 
         Raises:
             RunFolderError: the folder already holds a run.
-            ConfigError: see `assemble`.
+            ConfigError: see `assemble`; or the fleet cannot be checkpointed.
         """
         folder = config.folder
         _check_vacant(folder)
         assembly = assemble(config)
-        assembly.loop().state_dict()  # what cannot work is refused here, before minutes are spent on preparing
+        assembly.loop()  # what cannot work is refused here, before minutes are spent on preparing
+        if not assembly.fleet.can_checkpoint:
+            raise ConfigError(f"{config.task} cannot be checkpointed, and a run must be; use it in a Loop of your own")
         claim = lock(folder)
         _check_vacant(folder)  # another process may have made and left a run while this one assembled
         assembly = prepare(assembly, report)

@@ -24,8 +24,7 @@ class Fleet(VectorEnv[Any, Any, Any]):
       section 5.3, and `info["success"]` (N,) bool, true only on the step that completes the task.
     * A robot that violated its constraint stands still, whatever its action, and stays in violation until it is reset.
 
-    An episode that ends without violation ends in `success`, in `truncated`, or in both. What `step` and `reset` return
-    is the caller's: the fleet never writes to it again.
+    An episode that ends without violation ends in `success`, in `truncated`, or in both.
 
     `step` is `step_async` followed by `step_wait`, so that learning may run while physics does. Robots outside
     `active` are paused: time stops for them, their observation stays, their reward is 0. Fleets that cannot do this

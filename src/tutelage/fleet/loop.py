@@ -164,7 +164,9 @@ class Loop:
         changed = self.robot_of != before
 
         (left,) = np.nonzero((before != NOBODY) & changed & ~ended)
-        self._happen(Event.RELEASE, before[left], left)
+        down = self.violation[before[left]]
+        self._happen(Event.RELEASE, before[left[~down]], left[~down])
+        self._happen(Event.ABANDON, before[left[down]], left[down])
         (came,) = np.nonzero((self.robot_of != NOBODY) & (changed | ended))
         self._happen(Event.ASSIGN, self.robot_of[came], came)
 

@@ -1,8 +1,8 @@
 """What a run achieved and what it cost: ROHE, burden, idle time (sections 2.3, 3.3, 5.3 and 5.6).
 
-Every number is a pure function of the event log. `Tally` computes the same numbers while the loop runs, in O(N) a step and
-without keeping the log. Time is counted in timesteps; summed over robots it is robot-timesteps, and because a human is
-with one robot at a time, robot-timesteps with a human are human timesteps too.
+Every number is a pure function of the event log; `tutelage.fleet.tally` computes the same numbers while the loop runs. Time
+is counted in timesteps; summed over robots it is robot-timesteps, and because a human is with one robot at a time,
+robot-timesteps with a human are human timesteps too.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,6 @@ from numpy.typing import NDArray
 from tutelage.errors import ContractError
 from tutelage.fleet.events import Events
 from tutelage.fleet.modes import END_OF_STEP, HELPED, IDLE, TABLE, Event, Mode
-from tutelage.fleet.step import Step
-
-if TYPE_CHECKING:
-    from tutelage.fleet.loop import Loop
 
 Array = NDArray[Any]
 
@@ -288,7 +284,7 @@ def rohe(log: EventLog, unit: float = HUMAN_TIME_UNIT) -> float:
         log: the run.
         unit: timesteps in a unit of human time.
     """
-    return _rohe(log.num_humans, log.num_robots, successes(log), human_time(log).total, unit)
+    return rohe_of(log.num_humans, log.num_robots, successes(log), human_time(log).total, unit)
 
 
 def rohe_curve(log: EventLog, unit: float = HUMAN_TIME_UNIT) -> Array:
@@ -297,7 +293,8 @@ def rohe_curve(log: EventLog, unit: float = HUMAN_TIME_UNIT) -> Array:
     return np.asarray(log.num_humans / log.num_robots * successes_curve(log) / effort)
 
 
-def _rohe(humans: int, robots: int, tasks: int, human_steps: int, unit: float) -> float:
+def rohe_of(humans: int, robots: int, tasks: int, human_steps: int, unit: float = HUMAN_TIME_UNIT) -> float:
+    """Equation 5.2 itself, of M, N, completed tasks and human timesteps."""
     return humans / robots * tasks / (1 + human_steps / unit)
 
 
@@ -344,7 +341,7 @@ def cutoff_latency(log: EventLog, baseline: EventLog) -> float:
 
 
 def summary(log: EventLog) -> dict[str, float]:
-    """The numbers of `Tally.summary`, less the reward (which the log does not hold)."""
+    """All totals by name, as plain numbers; the sum of the rewards is not in the log."""
     time = human_time(log)
     return {
         "t": log.steps,
@@ -359,96 +356,3 @@ def summary(log: EventLog) -> dict[str, float]:
         "switches_to_robot": switches_to_robot(log),
         "rohe": rohe(log),
     }
-
-
-class Tally:
-    """The metrics of a run so far, step by step.
-
-    Args:
-        num_robots: N.
-        num_humans: M.
-    """
-
-    def __init__(self, num_robots: int, num_humans: int) -> None:
-        self.num_robots, self.num_humans = num_robots, num_humans
-        self.t = 0
-        self.reward = 0.0
-        self.events = np.zeros(len(Event), dtype=np.int64)
-        self.time = np.zeros(len(Mode), dtype=np.int64)
-        self.idle_time = 0
-        self.switches_to_robot = 0
-        self._mode = np.full(num_robots, Mode.AUTONOMOUS, dtype=np.int64)
-        self._broken = np.zeros(num_robots, dtype=np.bool_)  # for robots that are switching: were they violated before?
-
-    def update(self, step: Step) -> None:
-        """Add the timestep that follows the last one."""
-        events = step.events
-        before = modes_before(events, self._mode)
-        assigned = events.event == Event.ASSIGN
-        self._broken[events.robot[assigned]] = before[assigned] == Mode.VIOLATED
-        self._mode[events.robot] = events.mode  # where a robot occurs twice, the last event wins
-
-        self.t = step.t + 1
-        self.reward += float(np.sum(step.reward))
-        self.events += np.bincount(events.event, minlength=len(Event))
-        self.time += np.bincount(step.mode, minlength=len(Mode))
-        self.idle_time += int(np.count_nonzero(IDLE[step.mode] | ((step.mode == Mode.SWITCHING) & self._broken)))
-        self.switches_to_robot += int(np.count_nonzero((before == Mode.TELEOPERATED) & (events.mode != Mode.TELEOPERATED)))
-
-    def summary(self) -> dict[str, float]:
-        """The cumulative metrics by name, as plain numbers: what `summary` says of the log, and the sum of the rewards."""
-        count = {event: int(n) for event, n in zip(Event, self.events, strict=True)}
-        time = {mode: int(n) for mode, n in zip(Mode, self.time, strict=True)}
-        human = HumanTime(time[Mode.TELEOPERATED], time[Mode.RESETTING], time[Mode.SWITCHING])
-        return {
-            "t": self.t,
-            "successes": count[Event.SUCCESS],
-            "violations": count[Event.VIOLATE],
-            "hard_resets": count[Event.HARD_RESET],
-            "timeouts": count[Event.TIMEOUT],
-            "idle_time": self.idle_time,
-            "human_time": human.total,
-            **human._asdict(),
-            "switches_to_human": count[Event.TAKE_OVER],
-            "switches_to_robot": self.switches_to_robot,
-            "rohe": _rohe(self.num_humans, self.num_robots, count[Event.SUCCESS], human.total, HUMAN_TIME_UNIT),
-            "reward": self.reward,
-        }
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue, as arrays and JSON values."""
-        return {
-            "t": self.t,
-            "reward": self.reward,
-            "events": self.events.copy(),
-            "time": self.time.copy(),
-            "idle_time": self.idle_time,
-            "switches_to_robot": self.switches_to_robot,
-            "mode": self._mode.copy(),
-            "broken": self._broken.copy(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        for name in ("t", "reward", "idle_time", "switches_to_robot"):
-            setattr(self, name, state[name])
-        for name in ("events", "time"):
-            setattr(self, name, state[name].copy())
-        self._mode, self._broken = state["mode"].copy(), state["broken"].copy()
-
-
-class Counting:
-    """A subscriber that keeps a tally."""
-
-    def __init__(self, tally: Tally) -> None:
-        self.tally = tally
-
-    def on_start(self, loop: Loop) -> None:
-        """Nothing to do."""
-
-    def on_step(self, loop: Loop, step: Step) -> None:
-        """Count the step."""
-        self.tally.update(step)
-
-    def on_end(self, loop: Loop) -> None:
-        """Nothing to do."""

@@ -34,7 +34,7 @@ class Mode(IntEnum):
 
 
 class Event(IntEnum):
-    """What happens to a robot. The first six occur before the step, the others at its end."""
+    """What happens to a robot: at the end of the step if it is one of `END_OF_STEP`, otherwise before the step."""
 
     ASSIGN = 0
     """The allocation gives the robot to a human."""
@@ -43,7 +43,7 @@ class Event(IntEnum):
     START_RESET = 2
     """The human starts a hard reset."""
     RELEASE = 3
-    """The allocation takes the human away."""
+    """The allocation takes the human away from a robot that can go on by itself."""
     DISCONNECT = 4
     CONNECT = 5
     VIOLATE = 6
@@ -54,6 +54,8 @@ class Event(IntEnum):
     """The task was completed; the robot starts a new episode by itself (soft reset)."""
     TIMEOUT = 9
     """The horizon was reached without success; likewise."""
+    ABANDON = 10
+    """The allocation takes the human away from a robot in violation, before its hard reset is complete."""
 
 
 END_OF_STEP = (Event.VIOLATE, Event.HARD_RESET, Event.SUCCESS, Event.TIMEOUT)
@@ -63,10 +65,11 @@ INVALID = -1
 A, S, T, V, R, O = Mode  # noqa: E741 - a table is read by its shape
 _ROWS: dict[Mode, dict[Event, Mode]] = {
     A: {Event.ASSIGN: S, Event.VIOLATE: V, Event.SUCCESS: A, Event.TIMEOUT: A, Event.DISCONNECT: O},
-    S: {Event.TAKE_OVER: T, Event.START_RESET: R, Event.RELEASE: A, Event.VIOLATE: V, Event.DISCONNECT: O},
+    # Whether c(s) = 1 decides between TAKE_OVER and START_RESET, and between RELEASE and ABANDON: who has fallen never acts.
+    S: {Event.TAKE_OVER: T, Event.START_RESET: R, Event.RELEASE: A, Event.ABANDON: V, Event.VIOLATE: V, Event.DISCONNECT: O},
     T: {Event.RELEASE: A, Event.VIOLATE: V, Event.SUCCESS: T, Event.TIMEOUT: T, Event.DISCONNECT: O},
     V: {Event.ASSIGN: S, Event.DISCONNECT: O},
-    R: {Event.HARD_RESET: A, Event.RELEASE: V, Event.DISCONNECT: O},
+    R: {Event.HARD_RESET: A, Event.ABANDON: V, Event.DISCONNECT: O},
     O: {Event.CONNECT: A},
 }
 TABLE: NDArray[np.int8] = np.full((len(Mode), len(Event)), INVALID, dtype=np.int8)
