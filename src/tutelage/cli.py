@@ -115,6 +115,33 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
     console.print(f"report: {page}", highlight=False, soft_wrap=True)
 
 
+def reproduce(
+    what: Positional[Literal["figure-2.3", "figure-5.3", "figure-C.1"]],
+    tasks: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
+    full: bool = False,
+    workers: int = 4,
+    out: Path = Path("runs/reproduce"),
+    results: Path | None = None,
+) -> None:
+    """A figure or table of the dissertation: all algorithms and seeds in parallel, resumable, published beside ours.
+
+    Args:
+        what: figure-2.3 (LazyDAgger and its rivals), figure-5.3 (Fleet-DAgger's comparison, with table C.2), figure-C.1 (the
+            ablations of C.U.R.).
+        tasks: which tasks; default: those of the figure.
+        seeds: root seeds; default: 0 to 4 for figure-2.3, else 0 to 2.
+        full: the published scale; default: one that takes less than an hour on 4 cores.
+        workers: runs side by side, one core each.
+        out: folder of the run folders.
+        results: folder of the small result files; default: results in `out`.
+    """
+    from tutelage.experiments import reproduction
+
+    text = reproduction.reproduce(what, tasks, seeds, full, workers, out / what, results or out / "results")
+    console.print(text, highlight=False, soft_wrap=True)
+
+
 def train_expert(config: Annotated[ExpertConfig, arg(name="")]) -> None:
     """Train an algorithmic supervisor by PPO; resumable, scored over 100 episodes."""
     from tutelage.experiments.train_expert import train
@@ -268,6 +295,7 @@ def main(args: Sequence[str] | None = None) -> None:
         "resume": resume,
         "evaluate": evaluate,
         "report": report,
+        "reproduce": reproduce,
         "train-expert": train_expert,
         "check": check,
         "info": info,

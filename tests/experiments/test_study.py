@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fakes import PointFleet, make_loop
-from small import points
+from small import Here, points
 
 from tutelage.errors import RunFolderError, TutelageError
+from tutelage.experiments import jobs
 from tutelage.experiments import study as studies
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.evaluate import evaluate_run
@@ -115,27 +115,6 @@ def test_no_ablation_has_an_initial_period() -> None:
 # -- running it -----------------------------------------------------------------------------------------------------
 
 
-class Here:
-    """A pool of one: this process."""
-
-    def __init__(self, workers: int, mp_context: Any) -> None:
-        pass
-
-    def __enter__(self) -> Here:
-        return self
-
-    def __exit__(self, *args: Any) -> None:
-        pass
-
-    def submit(self, work: Any, *args: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(work(*args))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 @pytest.fixture
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StudyConfig:
     """A study of two seeds on points."""
@@ -155,7 +134,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StudyConfig:
         }
 
     monkeypatch.setattr(studies, "configurations", small)
-    monkeypatch.setattr(studies, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(jobs, "ProcessPoolExecutor", Here)
     return StudyConfig(
         "Walker2d",
         seeds=(0, 1),
@@ -226,12 +205,12 @@ def test_a_run_of_a_study_that_was_cut_short_is_continued(tiny: StudyConfig) -> 
     assert files(tiny.results) == before
 
 
-def test_a_failed_reference_ends_the_study_in_one_line(
+def test_a_failed_reference_ends_the_study(
     tiny: StudyConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("small.point_fleet", lambda num_envs: 1 / 0)
     with pytest.raises(
-        TutelageError, match="a run of C.U.R. failed, and its human time sets the others; mend it, then start"
+        TutelageError, match="2 runs failed .see above.: Walker2d C.U.R. seed 0, Walker2d C.U.R. seed 1; mend"
     ):
         run_study(tiny)
     out = capsys.readouterr().out
@@ -251,7 +230,7 @@ def test_a_failed_run_is_named_and_the_study_fails_after_the_others(
         return one(config, *args)
 
     monkeypatch.setattr(studies, "one", sometimes)
-    with pytest.raises(TutelageError, match="1 runs failed"):
+    with pytest.raises(TutelageError, match="1 runs failed .*Walker2d Random seed 1"):
         run_study(tiny)
     assert "Walker2d Random seed 1 FAILED" in capsys.readouterr().out
     assert len(files(tiny.results)) == 7

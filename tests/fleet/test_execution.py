@@ -22,8 +22,8 @@ def test_injected_noise_has_the_asked_for_variance_in_units_of_half_the_range() 
 def test_dagger_executes_the_human_with_probability_beta_to_the_epoch() -> None:
     mixture = BetaMixture(0.5, 10, default_rng(0))
     shares = [(mixture(t, WANTED, PROPOSED)[:, 0] == 0.5).mean() for t in (0, 9, 10, 25)]
-    np.testing.assert_allclose(shares, [1.0, 1.0, 0.5, 0.25], atol=0.04)
-    assert (BetaMixture(0.0, 10, default_rng(0))(10, WANTED, PROPOSED) == 0).all()
+    np.testing.assert_allclose(shares, [0.5, 0.5, 0.25, 0.125], atol=0.04)
+    assert (BetaMixture(0.0, 10, default_rng(0))(0, WANTED, PROPOSED) == 0).all()
 
 
 @pytest.mark.parametrize("make", [

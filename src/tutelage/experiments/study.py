@@ -12,11 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import multiprocessing
 import sys
-import traceback
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,14 +23,14 @@ import tyro
 from tyro.conf import Positional
 
 from tutelage.envs.tasks import TASKS
-from tutelage.errors import RunFolderError, TutelageError
-from tutelage.experiments.config import RunConfig, to_json
+from tutelage.errors import TutelageError
+from tutelage.experiments.config import RunConfig
+from tutelage.experiments.jobs import Job, resolved, run_jobs, slug, start_or_resume
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
 from tutelage.fleet.modes import Mode
 from tutelage.fleet.priority import PriorityConfig
 from tutelage.learning.imitation import LearnerConfig
 from tutelage.seeding import stream
-from tutelage.store import write_atomic
 
 BEHAVIOUR_CLONING = "C. (BC)"
 ABLATIONS = ("C.U.R.(-i)", "C.U.", "C.R.", "U.R.", "U.", "R.")
@@ -133,27 +130,19 @@ def configurations(study: StudyConfig, human_time: float | None) -> dict[str, Ru
 def one(config: RunConfig, evaluate: int, expert: bool) -> dict[str, Any]:
     """Run or continue one configuration, evaluate it, and return the small result. Runs in a process of its own."""
     from tutelage.experiments.records import load_run
-    from tutelage.experiments.run import Run
 
-    folder = config.folder
-    run = Run.resume(folder) if (folder / "config.json").exists() else Run.start(config)
-    _check_same(to_json(config), to_json(run.config), folder)
-    metrics = run.run()
-    resolved = to_json(run.config)
+    run = start_or_resume(config)
+    metrics, folder = run.run(), run.folder
     result: dict[str, Any] = {"algorithm": config.algorithm, "seed": config.seed, "metrics": metrics}
     if evaluate:
         result["evaluation"] = _evaluation(folder, evaluate, expert=False)
     if evaluate and expert:
         result["expert"] = _evaluation(folder, evaluate, expert=True)
-    record = load_run(folder)
-    lines = record.metrics
+    lines = load_run(folder).metrics
     pick = np.unique(np.linspace(0, len(lines["t"]) - 1, 50).round().astype(int))
     names = ("t", "successes", "hard_resets", "idle_time", "human_time", "rohe")
     result["curves"] = {name: [round(float(v), 4) for v in lines[name][pick]] for name in names}
-    for name in ("out", "threads", "torch_threads", "record"):
-        resolved.pop(name)
-    result["config"] = resolved
-    return result
+    return {**result, "config": resolved(run)}
 
 
 def _evaluation(folder: Path, steps: int, expert: bool) -> dict[str, Any]:
@@ -165,68 +154,38 @@ def _evaluation(folder: Path, steps: int, expert: bool) -> dict[str, Any]:
     return found if found.get("steps") == steps else evaluate_run(folder, steps, expert=expert)
 
 
-def _check_same(wanted: dict[str, Any], found: dict[str, Any], folder: Path) -> None:
-    """Refuse a run of the same name with other settings; what is None in `wanted` is for the run to resolve."""
-    for name, value in wanted.items():
-        if isinstance(value, dict):
-            _check_same(value, found[name], folder)
-        elif value is not None and value != found[name]:
-            raise RunFolderError(
-                f"{folder} was run with {name} {found[name]}, not {value}; delete it to run it again, or choose --out"
-            )
-
-
 def run_study(study: StudyConfig) -> list[dict[str, Any]]:
     """Run what is missing; returns the small results of all runs, also written one file each.
 
     Raises:
         TutelageError: a run failed. It was printed with its traceback, and the others were still run and written.
     """
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(study.workers, mp_context=context) as pool:
-        reference = _run_all(pool, study, configurations(study, None))
-        if len(reference) < len(study.seeds):
-            raise TutelageError("a run of C.U.R. failed, and its human time sets the others; mend it, then start again")
-        human_time = float(np.mean([r["metrics"]["human_time"] for r in reference]))
-        print(f"C.U.R. solicited {human_time:,.0f} human timesteps on average", flush=True)
-        others = configurations(study, human_time)
-        results = _run_all(pool, study, others)
-    failed = len(others) * len(study.seeds) - len(results)
-    if failed:
-        raise TutelageError(f"{failed} runs failed (see above); mend them, then start again: the others are kept")
-    return reference + results
+    reference = run_jobs(_jobs(study, configurations(study, None)), study.workers)
+    human_time = float(np.mean([r["metrics"]["human_time"] for r in reference]))
+    print(f"C.U.R. solicited {human_time:,.0f} human timesteps on average", flush=True)
+    return reference + run_jobs(_jobs(study, configurations(study, human_time)), study.workers)
 
 
-def _run_all(pool: ProcessPoolExecutor, study: StudyConfig, configs: dict[str, RunConfig]) -> list[dict[str, Any]]:
-    jobs = {}
+def _jobs(study: StudyConfig, configs: dict[str, RunConfig]) -> list[Job]:
+    jobs = []
     kind = "ablations" if study.ablations else "comparison"
     for seed in study.seeds:
         for name, config in configs.items():
-            slug = "".join(ch for ch in name.lower().replace("(-i)", "-no-initial") if ch.isalnum() or ch == "-")
             # C.U.R. is the same run in the comparison and among the ablations of equal length.
             place = study.out / f"{study.task}-{study.robots}x{study.humans}-{study.steps}"
-            config = dataclasses.replace(config, seed=seed, out=place / f"{slug}-s{seed}")
-            file = study.results / kind / study.task / f"{slug}-s{seed}.json"
+            config = dataclasses.replace(config, seed=seed, out=place / f"{slug(name)}-s{seed}")
+            file = study.results / kind / study.task / f"{slug(name)}-s{seed}.json"
             expert = name == "C.U.R." and not study.ablations
-            jobs[pool.submit(one, config, study.evaluate, expert)] = (f"{study.task} {name} seed {seed}", file)
-    results = []
-    for job in as_completed(jobs):
-        title, file = jobs[job]
-        try:
-            result = job.result()
-        except Exception:  # whatever stopped one run must not stop the others; `run_study` raises in the end
-            print(f"{title} FAILED\n{traceback.format_exc()}", flush=True)
-            continue
-        write_atomic(file, (json.dumps(result, indent=1) + "\n").encode())
-        m, e = result["metrics"], result.get("evaluation", {})
-        print(
-            f"{title}: successes {m['successes']:.0f}, hard resets {m['hard_resets']:.0f}, "
-            f"human time {m['human_time']:.0f}, "
-            f"ROHE {m['rohe']:.3f}; frozen: successes {e.get('successes', float('nan')):.0f}",
-            flush=True,
-        )
-        results.append(result)
-    return results
+            jobs.append(Job(f"{study.task} {name} seed {seed}", one, (config, study.evaluate, expert), file, _summary))
+    return jobs
+
+
+def _summary(result: dict[str, Any]) -> str:
+    m, frozen = result["metrics"], result.get("evaluation", {}).get("successes", float("nan"))
+    return (
+        f"successes {m['successes']:.0f}, hard resets {m['hard_resets']:.0f}, human time {m['human_time']:.0f}, "
+        f"ROHE {m['rohe']:.3f}; frozen: successes {frozen:.0f}"
+    )
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -74,12 +74,13 @@ class NoiseInjection:
 
 
 class BetaMixture:
-    """DAgger (Ross et al. 2011): pi_i = beta_i pi_H + (1 - beta_i) pi_R, with beta_i = beta^i in epoch i.
+    """DAgger (Ross et al. 2011): pi_i = beta_i pi_H + (1 - beta_i) pi_R, with beta_i = beta^i in epoch i = 1, 2, ...
 
-    In each timestep, each robot executes the human's action with probability beta_i and its own otherwise.
+    In each timestep, each robot executes the human's action with probability beta_i and its own otherwise. Epoch 0, in which
+    the human alone acts, is the offline data.
 
     Args:
-        beta: beta, in [0, 1]; 0: the human acts in the first epoch only (0^0 = 1).
+        beta: beta, in [0, 1]; 0: the robot always acts.
         every: timesteps of an epoch.
         rng: the seeded stream of the choices.
     """
@@ -90,7 +91,7 @@ class BetaMixture:
         self.beta, self.every, self.rng = beta, every, rng
 
     def __call__(self, t: int, wanted: Array, proposed: Array) -> Array:
-        human = self.rng.random(len(wanted)) < self.beta ** (t // self.every)
+        human = self.rng.random(len(wanted)) < self.beta ** (1 + t // self.every)
         return np.where(human[:, None], wanted, proposed)
 
     def state_dict(self) -> dict[str, Any]:

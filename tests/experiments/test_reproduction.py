@@ -1,0 +1,105 @@
+"""`tutelage reproduce`: figure 2.3 from runs to table and picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small import Here
+
+from tutelage.errors import ConfigError
+from tutelage.experiments import figure_2_3, jobs, reproduction
+from tutelage.experiments.figure_2_3 import ALGORITHMS, BC, LAZY, SAFE, Figure23Config, configuration
+from tutelage.experiments.rollouts import rollout
+from tutelage.learning.critic import CriticConfig
+from tutelage.policies.expert import GaussianActor
+
+pytest.importorskip("mujoco")
+pytest.importorskip("matplotlib")
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Epochs of 20 timesteps, in this process."""
+    make = configuration
+
+    def small(*args: Any) -> Any:
+        config = make(*args)
+        learner = dataclasses.replace(config.learner, every=20, gradient_steps=5, pretrain=20, batch=16)
+        gate = dataclasses.replace(config.gate, beta_h=None, unsafe=0.7)
+        return dataclasses.replace(
+            config, steps=40, checkpoint_every=20, metrics_every=20, learner=learner, gate=gate, hidden=(16,),
+            offline_pairs=(config.offline_pairs or 0) - 3000, critic=CriticConfig(pretrain=5),
+        )  # fmt: skip
+
+    monkeypatch.setattr(figure_2_3, "configuration", small)
+    monkeypatch.setattr(figure_2_3.TestRollouts.__init__, "__defaults__", (1,))
+    monkeypatch.setattr(jobs, "ProcessPoolExecutor", Here)
+
+
+def test_figure_2_3_from_runs_to_table_and_picture(tiny: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = reproduction.reproduce("figure-2.3", ("Walker2d",), (0, 1), False, 1, tmp_path / "runs", tmp_path / "results")
+    place = tmp_path / "results" / "single" / "figure-2.3"
+    results = [json.loads(path.read_text()) for path in sorted((place / "Walker2d").glob("*.json"))]
+    assert sorted({r["algorithm"] for r in results}) == sorted(ALGORITHMS)
+    assert len(results) == 12
+    for r in results:
+        assert [e["epoch"] for e in r["epochs"]] == [0, 1, 2]
+        actions = [e["supervisor_actions"] for e in r["epochs"]]
+        assert actions == sorted(actions)
+        assert (actions[-1] > 0) == (r["algorithm"] != BC)
+    dagger = next(r for r in results if r["algorithm"] == "DAgger")
+    assert dagger["epochs"][-1]["supervisor_actions"] == 40 - dagger["metrics"]["resetting"]
+    lazy = np.mean([r["epochs"][-1]["supervisor_actions"] for r in results if r["algorithm"] == LAZY])
+    cloning = next(r for r in results if r["algorithm"] == BC)
+    assert cloning["config"]["offline_pairs"] == 1000 + round(lazy)
+    assert (place / "table.md").read_text() == text
+    assert "| Walker2d | -56% |" in text
+    assert (place / "figure.png").stat().st_size > 20_000
+    assert f"Walker2d {LAZY} seed 1: return" in capsys.readouterr().out
+
+    files = {path: path.read_bytes() for path in place.rglob("*.json")}
+    assert (
+        reproduction.reproduce("figure-2.3", ("Walker2d",), (0, 1), False, 1, tmp_path / "runs", tmp_path / "results")
+        == text
+    )
+    assert {path: path.read_bytes() for path in place.rglob("*.json")} == files, "complete runs are kept"
+
+
+def test_the_settings_are_those_of_table_a_1() -> None:
+    lazy, safe = configuration("Ant", LAZY, True), configuration("Ant", SAFE, True)
+    assert (lazy.steps, lazy.learner.every, lazy.learner.gradient_steps, lazy.offline_pairs) == (75_000, 5000, 2000, 4000)
+    assert (lazy.gate.beta_h, lazy.gate.beta_r, lazy.gate.noise) == (5e-3, 0.5, 0.05)
+    assert safe.gate.beta_h is None
+    assert configuration("Ant", "LazyDAgger (-Noise)", True).gate.noise == 0
+    assert configuration("Ant", "LazyDAgger (-Switch to Auto)", True).gate.ask_again
+    assert configuration("Walker2d", BC, False, 70).offline_pairs == 4070
+
+
+def test_the_cutoff_latency_and_the_change_are_those_of_the_means() -> None:
+    def result(algorithm: str, actions: int, switches: int, seed: int) -> dict[str, Any]:
+        last = {"epoch": 1, "return_mean": 900.0, "supervisor_actions": actions, "context_switches": switches}
+        return {"task": "Walker2d", "algorithm": algorithm, "seed": seed, "epochs": [last], "expert_return": 1000.0}
+
+    runs = [result(LAZY, 500, 40, 0), result(LAZY, 700, 60, 1), result(SAFE, 300, 90, 0), result(SAFE, 300, 110, 1)]
+    text = figure_2_3.table(runs, True)
+    assert "| Walker2d | -56% | -50% | 4.3 | 6.0 |" in text  # (600 - 300) / (100 - 50)
+    assert f"| Walker2d | {LAZY} | 0.90 ± 0.00 | 600 ± 1,271 | 50 ± 127 |" in text
+
+
+def test_a_rollout_counts_until_the_fall(tmp_path: Path) -> None:
+    config = configuration("Walker2d", LAZY, False)
+    idle = GaussianActor(17, -np.ones(6), np.ones(6), (8,))
+    score = rollout(config, idle, 3, "a test")
+    assert score == rollout(config, idle, 3, "a test")
+    assert score["survived"] == score["succeeded"] == 0
+    assert 0 < score["return_mean"] < 500
+
+
+def test_what_figure_2_3_does_not_have_is_refused() -> None:
+    with pytest.raises(ConfigError, match="figure 2.3 has the tasks HalfCheetah, Walker2d, Ant; got Humanoid"):
+        Figure23Config(tasks=("Humanoid",))
