@@ -1,7 +1,8 @@
 """Figure 2.3: LazyDAgger, its ablations and its rivals on three locomotion tasks (section 2.6, appendix A.1).
 
 One robot and one human, epochs of T timesteps, after each a round of training and ten test rollouts without help. Behaviour
-cloning gets as many more offline pairs as LazyDAgger had supervisor actions.
+cloning gets as many more offline pairs as LazyDAgger had supervisor actions. The tasks have their own level of disturbance, and
+demonstrations are given in calm: without disturbances, cloning 4,000 pairs already does what our experts do.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def configuration(task: str, algorithm: str, full: bool, more_pairs: int = 0) ->
     )
     priority = {BC: "C.", SAFE: "SafeDAgger", "DAgger": "DAgger"}.get(algorithm, LAZY)
     return RunConfig(
-        task, priority, robots=1, humans=1, steps=epochs * every, t_teleop=1, t_reset=1, disturbance="none",
+        task, priority, robots=1, humans=1, steps=epochs * every, t_teleop=1, t_reset=1,
         offline_pairs=4000 + more_pairs, calibration_steps=1, gate=gate, learner=learner, members=1, bootstrap=False,
         threads=1, torch_threads=1, checkpoint_every=every, metrics_every=every, record="none", label=algorithm,
     )  # fmt: skip
@@ -125,7 +126,7 @@ def one(config: RunConfig) -> dict[str, Any]:
             switches = lines["switches_to_human"][k] + lines["switches_to_robot"][k]
             counts = {"supervisor_actions": int(lines["teleoperation"][k]), "context_switches": int(switches)}
             epochs.append({"epoch": int(t // every), **tests.scores[str(int(t // every))], **counts})
-    expert = experts.load(config.task)[1]["scores"]["none"]["mean"]
+    expert = experts.load(config.task)[1]["scores"][run.config.disturbance]["mean"]
     return {
         "task": config.task, "algorithm": config.algorithm, "seed": config.seed, "epochs": epochs, "metrics": metrics,
         "expert_return": expert, "config": resolved(run),
