@@ -28,7 +28,7 @@ from tutelage.policies.expert import GaussianActor
 pytest.importorskip("mujoco")
 pytest.importorskip("pyarrow")
 
-VERBS = ("run", "resume", "evaluate", "report", "train-expert", "check", "info")
+VERBS = ("run", "resume", "evaluate", "report", "reproduce", "train-expert", "check", "info")
 POINTS = [*FLAGS[FLAGS.index("--steps") :], "--robots", "6", "--humans", "2", "--expert", "small:Homing"]
 POINTS[POINTS.index("--threads") : POINTS.index("--threads") + 2] = []
 POINTS[POINTS.index("--offline-pairs") + 1] = "100"
@@ -289,6 +289,12 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["report", "lost"], "lost is not a run folder: no such folder; give a folder that `tutelage run` wrote"),
         (["report", "."], ". is not a run folder: it has no config.json; give a folder that `tutelage run` wrote"),
         (["report"], "name at least one run folder, such as: tutelage report runs/*"),
+        (["reproduce", "figure-5.3", "--tasks", "Nope"], "unknown task 'Nope'; known tasks: *"),
+        (
+            ["reproduce", "figure-2.3", "--tasks", "Humanoid"],
+            "figure 2.3 has the tasks HalfCheetah, Walker2d, Ant; got Humanoid",
+        ),
+        (["reproduce", "figure-2.3", "--workers", "0"], "workers must be at least 1, got 0"),
         (["train-expert", "Nope"], "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid"),
         (["train-expert", "Walker2d", "--steps", "0"], "steps must be at least 1, got 0"),
         (

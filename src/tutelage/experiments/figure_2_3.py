@@ -81,6 +81,8 @@ class Figure23Config:
 
     def __post_init__(self) -> None:
         unknown = [task for task in self.tasks if task not in SETTINGS]
+        if self.workers < 1:
+            raise ConfigError(f"workers must be at least 1, got {self.workers}")
         if unknown or not self.tasks or not self.seeds:
             raise ConfigError(f"figure 2.3 has the tasks {', '.join(SETTINGS)}; got {', '.join(unknown) or 'nothing to do'}")
 

@@ -23,7 +23,7 @@ import tyro
 from tyro.conf import Positional
 
 from tutelage.envs.tasks import TASKS
-from tutelage.errors import TutelageError
+from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.jobs import Job, resolved, run_jobs, slug, start_or_resume
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
@@ -64,6 +64,12 @@ class StudyConfig:
     workers: int = 4
     out: Path = Path("runs/study")
     results: Path = Path("results/fleet")
+
+    def __post_init__(self) -> None:
+        if self.task not in TASKS:
+            raise ConfigError(f"unknown task {self.task!r}; known tasks: {', '.join(TASKS)}")
+        if not self.seeds or self.workers < 1 or self.evaluate < 0:
+            raise ConfigError("a study needs at least one seed and one worker, and evaluate >= 0")
 
 
 def random_threshold(budget: float, steps: int, robots: int, humans: int, t_teleop: int, t_reset: int) -> float:
