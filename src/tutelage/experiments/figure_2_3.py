@@ -10,6 +10,7 @@ a policy cloned from 4,000 calm pairs of Walker2d then already reaches the exper
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tutelage.envs import experts
-from tutelage.errors import ConfigError, MissingExtraError
+from tutelage.errors import ConfigError, MissingExtraError, RunFolderError
 from tutelage.experiments import plots
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.jobs import Job, resolved, run_jobs, slug, start_or_resume
@@ -69,7 +70,7 @@ class Figure23Config:
             2,000 timesteps and 1,000 gradient steps.
         workers: runs side by side, one core each.
         out: folder of the run folders.
-        results: folder of the small result files, the table and the figure.
+        results: folder of the small result files and the figure.
     """
 
     tasks: tuple[str, ...] = tuple(SETTINGS)
@@ -138,7 +139,7 @@ def one(config: RunConfig) -> dict[str, Any]:
 
 
 def reproduce(config: Figure23Config) -> str:
-    """Run what is missing, write the table and the figure; returns the table as Markdown.
+    """Run what is missing and draw the figure; returns the table as Markdown.
 
     Raises:
         TutelageError: a run failed.
@@ -152,9 +153,7 @@ def reproduce(config: Figure23Config) -> str:
     }
     cloning = [_job(config, task, BC, seed, more[task]) for task in config.tasks for seed in config.seeds]
     results += run_jobs(cloning, config.workers)
-    text = table(results, config.full)
-    config.results.mkdir(parents=True, exist_ok=True)
-    (config.results / "table.md").write_text(text, encoding="utf-8")
+    text = table(results)
     try:
         plots.save(figure(results), config.results / "figure.png")
     except MissingExtraError as error:
@@ -188,10 +187,25 @@ def last(results: list[dict[str, Any]], task: str, algorithm: str, name: str) ->
     return np.array([r["epochs"][-1][name] / (r["expert_return"] if name == "return_mean" else 1) for r in mine])
 
 
-def table(results: list[dict[str, Any]], full: bool) -> str:
+def read(folder: Path) -> list[dict[str, Any]]:
+    """The small result files below a folder.
+
+    Raises:
+        RunFolderError: a damaged file.
+    """
+    try:
+        return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/*.json"))]
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"a result file in {folder} is damaged: {error}") from None
+
+
+def table(results: list[dict[str, Any]]) -> str:
     """Published and ours side by side, as Markdown."""
     tasks = [task for task in SETTINGS if any(r["task"] == task for r in results)]
-    scale = "published scale" if full else "small scale: 5 epochs of 2,000 timesteps"
+    every = results[0]["config"]["learner"]["every"]
+    scale = (
+        "published scale" if every == 5000 else f"small scale: {len(results[0]['epochs']) - 1} epochs of {every:,} timesteps"
+    )
     lines = [
         f"Figure 2.3, {scale}, {len({r['seed'] for r in results})} seeds, mean ± 95 % interval over seeds. Return: of ten "
         "test rollouts after the last epoch, as a fraction of the expert's.",

@@ -4,11 +4,12 @@
     python -m tutelage.experiments.tables results/fleet --check    # exit 1 if the page does not say what the files say
 
 Only what stands between `<!-- begin: NAME -->` and `<!-- end: NAME -->` is rewritten: `tables` in results.md, and `levels`
-in tasks.md from results/levels.json.
+in tasks.md from results/levels.json, and `figure 2.3` in results-single.md where results/single/figure-2.3 exists.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,7 @@ from tyro.conf import Positional
 
 from tutelage.envs.tasks import TASKS
 from tutelage.errors import RunFolderError, TutelageError
-from tutelage.experiments import plots
+from tutelage.experiments import figure_2_3, plots
 from tutelage.experiments.figures import figure, figure_name
 from tutelage.experiments.levels import suits
 from tutelage.experiments.relations import Relation, ablation_relations, relations
@@ -251,6 +252,9 @@ def run(config: TablesConfig) -> list[Path]:
         config.docs / "results.md": ("tables", tables(config.results)),
         config.docs / "tasks.md": ("levels", levels(config.results.parent / "levels.json")),
     }
+    single = config.results.parent / "single" / "figure-2.3"
+    if single.exists():
+        parts[config.docs / "results-single.md"] = ("figure 2.3", figure_2_3.table(figure_2_3.read(single)))
     stale = []
     for path, (name, content) in parts.items():
         page = path.read_text(encoding="utf-8")
@@ -259,14 +263,20 @@ def run(config: TablesConfig) -> list[Path]:
             stale.append(path)
             if not config.check:
                 write_atomic(path, wanted.encode())
-    for kind in ("comparison", "ablations"):
-        for task, groups in read(config.results, kind).items():
-            path = config.docs / "images" / figure_name(task, kind)
-            if not config.check:
-                plots.save(figure(task, groups), path)
-                stale.append(path)
-            elif not path.exists():
-                stale.append(path)
+    draw = {
+        figure_name(task, kind): functools.partial(figure, task, groups)
+        for kind in ("comparison", "ablations")
+        for task, groups in read(config.results, kind).items()
+    }
+    if single.exists():
+        draw["figure-2.3.png"] = functools.partial(figure_2_3.figure, figure_2_3.read(single))
+    for name, make in draw.items():
+        path = config.docs / "images" / name
+        if not config.check:
+            plots.save(make(), path)
+            stale.append(path)
+        elif not path.exists():
+            stale.append(path)
     return stale
 
 
