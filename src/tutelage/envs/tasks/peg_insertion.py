@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tutelage.envs.tasks import arm
 from tutelage.envs.tasks.base import Array, Frame, GoalTask
 
-STEP, TWIST = 0.02, 0.3
+STEP, TWIST = 0.01, 0.2
 """How far one decision moves the gripper along each axis, m, and turns it, rad, at most."""
 OPEN, SHUT = 0.04, -0.01
 """Commands of the fingers: distance from the middle, m. They stop at what is between them."""
