@@ -13,6 +13,7 @@ import torch
 from tutelage.cores import default_torch_threads
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
+from tutelage.errors import ConfigError
 from tutelage.experiments.config import ExpertConfig
 from tutelage.learning.ppo import PPO
 from tutelage.policies.expert import GaussianActor
@@ -21,6 +22,8 @@ from tutelage.store import load_tree
 
 def train(config: ExpertConfig, say: Callable[[str], None] = print) -> Path:
     """Train, score and save a controller; returns the path of its weights."""
+    if experts.program_of(config.task):
+        raise ConfigError(f"the expert of {config.task} is a program, {experts.program_of(config.task)}: nothing to train")
     torch.set_num_threads(config.torch_threads or default_torch_threads())
     out = config.out or Path("runs") / f"expert-{config.task}"
     fleet = MujocoFleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)

@@ -11,7 +11,14 @@ from tutelage.envs.tasks.peg_insertion import GRIP, OPEN, PEG, PEG_HEIGHT, STEP,
 
 Mask = NDArray[np.bool_]
 
-_GRIP, _HEADING, _FINGER, _RING, _HANDLE, _AXIS = slice(18, 21), slice(21, 23), 23, slice(25, 28), slice(28, 31), slice(31, 34)
+_GRIP, _HEADING, _FINGER, _RING, _HANDLE, _AXIS = (
+    slice(18, 21),
+    slice(21, 23),
+    23,
+    slice(25, 28),
+    slice(28, 31),
+    slice(31, 34),
+)
 
 OVER_HANDLE, OVER_PEG, DOWN = 0.06, 0.03, 0.03
 """How high the grip approaches above the handle, the ring above the tip of the peg; where the ring is let go, m."""
@@ -48,16 +55,19 @@ class PegInserter:
         blocked = ~held & (point[:, 2] < PEG_HEIGHT) & _blocked(point, bearing)
 
         move, shut = _fetch(grip, point, turn, finger)
-        for mask, (other_move, other_shut) in ((blocked, _drag(grip, ring, finger)), (held, _carry(grip, ring, obs[:, _AXIS]))):
+        for mask, (other_move, other_shut) in (
+            (blocked, _drag(grip, ring, finger)),
+            (held, _carry(grip, ring, obs[:, _AXIS])),
+        ):
             move, shut = np.where(mask[:, None], other_move, move), np.where(mask, other_shut, shut)
         twist = np.where(held, 0.0, turn / TWIST)
         command = np.column_stack([move / STEP, twist, np.where(shut, 1.0, -1.0)])
-        return np.clip(command, -1.0, 1.0).astype(np.float32)
+        return np.clip(command, -1.0, 1.0).astype(np.float32)  # type: ignore[no-any-return]
 
 
 def _turn(yaw: Array, bearing: Array) -> Array:
     """The smallest turn (N,), rad, after which the fingers close across the handle: either way round will do."""
-    turn = (bearing - yaw + np.pi / 2) % np.pi - np.pi / 2
+    turn: Array = (bearing - yaw + np.pi / 2) % np.pi - np.pi / 2
     return np.where(np.abs(yaw + turn) > arm.TURN - 0.1, turn - np.sign(yaw + turn) * np.pi, turn)
 
 

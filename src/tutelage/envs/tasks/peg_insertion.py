@@ -90,14 +90,16 @@ class PegInsertion(GoalTask):
 
     def success(self, frame: Frame) -> NDArray[np.bool_]:
         ring, _, axis = _ring(frame)
-        around = np.linalg.norm(ring[:, :2] - PEG, axis=1) < 1.2 * CLEARANCE  # a tilted ring's hole is a little off its middle
+        around = (
+            np.linalg.norm(ring[:, :2] - PEG, axis=1) < 1.2 * CLEARANCE
+        )  # a tilted ring's hole is a little off its middle
         let_go = frame["qpos"][:, _FINGERS].min(axis=1) > THICKNESS / 2 + 0.005
-        return around & (ring[:, 2] < LOW_ENOUGH) & (np.abs(axis[:, 2]) > 0.8) & let_go  # type: ignore[no-any-return]
+        return np.asarray(around & (ring[:, 2] < LOW_ENOUGH) & (np.abs(axis[:, 2]) > 0.8) & let_go)
 
     def violation(self, frame: Frame) -> NDArray[np.bool_]:
         x, y, z = frame["qpos"][:, _RING].T
         (left, near), (right, far) = TABLE
-        return ~((z > -0.02) & (x > left) & (x < right) & (y > near) & (y < far))
+        return ~((z > -0.02) & (x > left) & (x < right) & (y > near) & (y < far))  # type: ignore[no-any-return]
 
     def initial(self, rng: np.random.Generator, n: int, qpos0: Array, qvel0: Array) -> tuple[Array, Array]:
         qpos = np.tile(qpos0, (n, 1))
