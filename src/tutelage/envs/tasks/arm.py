@@ -17,8 +17,8 @@ SHOULDER, UPPER, FORE, ASIDE, FORWARD = 0.1625, 0.425, 0.3922, 0.1333, 0.0997
 """Height of the shoulder, lengths of upper arm and forearm, offsets of the wrist to the left and forward, m."""
 GRIP = 0.0996 + 0.18
 """From the last elbow of the wrist down to the middle of the finger pads, m."""
-LOW, HIGH = np.array([-0.26, -0.42, 0.012]), np.array([0.36, 0.42, 0.32])
-"""The box in which the gripper moves: all of the table, and never a point that the arm cannot reach."""
+LOW, HIGH = np.array([-0.26, -0.38, 0.012]), np.array([0.36, 0.38, 0.25])
+"""The box in which the gripper moves, m: all of the table and a little more. The arm stretches towards what is too far."""
 TURN = 1.8
 """The gripper's yaw stays within plus or minus this, rad: a little more than the half turn that a parallel gripper needs."""
 

@@ -51,7 +51,7 @@ class PegInsertion(GoalTask):
     fields = ("qpos", "qvel", "site_xpos", "site_xmat")
     push_body, camera = "ring", "fixed"
     horizon = 175
-    disturbance = "moderate"
+    disturbance = "strong"
     offline_pairs = 2687
     expert = "tutelage.envs.experts.peg_insertion:PegInserter"
     action_low, action_high = (-np.ones(5, dtype=np.float32), np.ones(5, dtype=np.float32))
