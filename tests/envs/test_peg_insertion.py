@@ -17,6 +17,9 @@ from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.tasks import TASKS, GoalTask, arm
 from tutelage.envs.tasks.peg_insertion import OPEN, PEG, PEG_HEIGHT, STEP, TABLE, TWIST
 from tutelage.errors import ConfigError, TutelageError
+from tutelage.experiments.assemble import assemble, demonstrations
+from tutelage.experiments.config import ExpertConfig, RunConfig
+from tutelage.experiments.train_expert import train
 
 GRIP, HEADING, FINGER, RING, HANDLE, AXIS = slice(18, 21), slice(21, 23), 23, slice(25, 28), slice(28, 31), slice(31, 34)
 
@@ -297,3 +300,46 @@ def test_the_picture_shows_arm_ring_and_peg(arms: MujocoFleet) -> None:
     assert ((red > blue + 60) & (red > green + 30)).sum() > 20, "the ring"
     assert ((green > red + 25) & (green > blue + 10)).sum() > 20, "the peg"
     assert (blue > red + 60).sum() > 100, "the arm's joints"
+
+
+# -- runs -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_demonstration_ends_with_its_success_and_the_next_one_begins_anew() -> None:
+    config = RunConfig("PegInsertion", disturbance="none", offline_pairs=450, threads=1)
+    actor = PegInserter()
+    obs, actions = demonstrations(config, actor, 175)
+    assert obs.shape == (450, 41)
+    np.testing.assert_allclose(actions, actor.act(obs), atol=1e-3)
+    jumps = np.linalg.norm(np.diff(obs[:, GRIP], axis=0), axis=1) > 2 * STEP  # from the peg back to the start
+    ends = np.flatnonzero(jumps)
+    assert 4 <= len(ends) <= 6
+    lengths = np.diff([-1, *ends])
+    assert (lengths > 60).all()
+    assert (lengths < 120).all()
+    assert (obs[ends][:, RING][:, 2] < 0.05).all(), "around the peg, about to be let go"
+    assert (np.linalg.norm(obs[ends][:, RING][:, :2] - PEG, axis=1) < 0.015).all()
+    assert (actions[ends, 4] < 0).all()
+
+
+class Idle:
+    """A human who does nothing."""
+
+    def act(self, obs: Any) -> Any:
+        return np.zeros((len(obs), 5), dtype=np.float32)
+
+
+def test_a_human_who_does_not_reach_the_goal_cannot_demonstrate() -> None:
+    config = RunConfig("PegInsertion", disturbance="none", offline_pairs=10, threads=1)
+    with pytest.raises(ConfigError, match="the expert did not reach the goal in 3 of 3 demonstrations"):
+        demonstrations(config, Idle(), 175)
+
+
+def test_the_run_of_a_goal_task_needs_no_return_and_its_human_is_not_trained() -> None:
+    assembly = assemble(RunConfig("PegInsertion", priority="U.G.C.", robots=2, humans=1, threads=1, torch_threads=1))
+    assert isinstance(assembly.actor, PegInserter)
+    assert (assembly.config.offline_pairs, assembly.config.disturbance) == (2687, TASKS["PegInsertion"].disturbance)
+    assert list(assembly.learner.critics) == ["goal"]
+    assembly.fleet.close()
+    with pytest.raises(ConfigError, match="is a program, .*PegInserter: nothing to train"):
+        train(ExpertConfig("PegInsertion"))
