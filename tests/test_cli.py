@@ -18,6 +18,7 @@ from small import FLAGS, assert_same, points, walker
 
 import tutelage
 from tutelage import cli
+from tutelage.envs.tasks import TASKS
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.recording import lock
 from tutelage.experiments.run import Run
@@ -118,7 +119,7 @@ def test_info(tut: Callable[..., Said]) -> None:
     tasks = tut("info").out
     assert tasks == tut("info", "tasks").out
     assert re.search(r"^ Walker2d +17 +6 +1000 +moderate +expert +\d+ \(published 3492\) +\d+% of 100 ", tasks, re.MULTILINE)
-    assert [line.split()[0] for line in tasks.splitlines()[1:]] == ["HalfCheetah", "Walker2d", "Ant", "Humanoid"]
+    assert [line.split()[0] for line in tasks.splitlines()[1:]] == [*TASKS]
     levels = tut("info", "levels").out
     assert [line.split()[0] for line in levels.splitlines()] == [
         "level", "none", "mild", "light", "moderate", "strong", "severe", "extreme",
@@ -242,7 +243,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
     [
         (
             ["run", "Walkr2d"],
-            "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, "
+            "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, "
             "or your own as module:callable",
         ),
         (["run", "nowhere:make"], "task 'nowhere:make': no module 'nowhere'; install it, or run where Python finds it"),
@@ -288,7 +289,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["report", "lost"], "lost is not a run folder: no such folder; give a folder that `tutelage run` wrote"),
         (["report", "."], ". is not a run folder: it has no config.json; give a folder that `tutelage run` wrote"),
         (["report"], "name at least one run folder, such as: tutelage report runs/*"),
-        (["train-expert", "Nope"], "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid"),
+        (["train-expert", "Nope"], "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion"),
         (["train-expert", "Walker2d", "--steps", "0"], "steps must be at least 1, got 0"),
         (
             ["train-expert", "Walker2d", "--ppo.rollout", "0"],

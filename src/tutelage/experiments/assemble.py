@@ -146,8 +146,7 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
         obs, _ = fleet.reset(seed=seed)
         seen, done, ends, failed = _episodes(fleet, actor, obs, horizon if goal else length)
         good = np.flatnonzero(~failed)
-        enough = spare / 2 if goal else episodes
-        if len(good) < enough:
+        if len(good) < (1 if goal else episodes):
             what = "did not reach the goal" if goal else "fell"
             raise ConfigError(f"the expert {what} in {int(failed.sum())} of {spare} demonstrations; choose a calmer level")
         good = good if goal else good[:episodes]

@@ -22,11 +22,12 @@ from tutelage.store import load_tree
 
 def train(config: ExpertConfig, say: Callable[[str], None] = print) -> Path:
     """Train, score and save a controller; returns the path of its weights."""
-    if experts.program_of(config.task):
-        raise ConfigError(f"the expert of {config.task} is a program, {experts.program_of(config.task)}: nothing to train")
     torch.set_num_threads(config.torch_threads or default_torch_threads())
     out = config.out or Path("runs") / f"expert-{config.task}"
     fleet = MujocoFleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)
+    if fleet.task.expert:
+        fleet.close()
+        raise ConfigError(f"the expert of {config.task} is a program, {fleet.task.expert}: nothing to train")
     level = config.disturbance or fleet.task.disturbance
     ppo = PPO(fleet, fleet.task.expert_features or fleet.single_observation_space.shape[0], config.ppo, config.seed)  # type: ignore[index]
     checkpoint, best_path, best = out / "ppo.safetensors", out / "best.safetensors", float("-inf")

@@ -3,7 +3,7 @@
 A controller is a file of trained weights, or a program that the task names (`MujocoTask.expert`). One with weights is called
 an expert only if its mean return reaches the published expert's (see `PUBLISHED`). The scores of a program are measured by
 
-    python -m tutelage.envs.experts PegInsertion
+    python -m tutelage.envs.experts.score PegInsertion
 """
 
 from __future__ import annotations

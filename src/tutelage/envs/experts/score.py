@@ -1,6 +1,6 @@
 """Measure what a program scores over 100 episodes, in calm and at the task's level, and write it beside the weights.
 
-python -m tutelage.envs.experts PegInsertion
+python -m tutelage.envs.experts.score PegInsertion
 """
 
 from __future__ import annotations
