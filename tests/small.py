@@ -83,6 +83,13 @@ class Homing:
         return np.clip(-5 * obs[:, [POSITION]], -1, 1).astype(np.float32)
 
 
+class Reaching:
+    """The way to the goal of `goal_fleet`."""
+
+    def act(self, obs: Any) -> Any:
+        return np.clip(5 * (0.25 - obs[:, [POSITION]]), -1, 1).astype(np.float32)
+
+
 class GoalFleet(PointFleet):
     """Points with a goal state."""
 

@@ -18,6 +18,7 @@ from small import FLAGS, assert_same, points, walker
 
 import tutelage
 from tutelage import cli
+from tutelage.envs.tasks import TASKS
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.recording import lock
 from tutelage.experiments.run import Run
@@ -119,7 +120,7 @@ def test_info(tut: Callable[..., Said]) -> None:
     tasks = tut("info").out
     assert tasks == tut("info", "tasks").out
     assert re.search(r"^ Walker2d +17 +6 +1000 +moderate +expert +\d+ \(published 3492\) +\d+% of 100 ", tasks, re.MULTILINE)
-    assert [line.split()[0] for line in tasks.splitlines()[1:]] == ["HalfCheetah", "Walker2d", "Ant", "Humanoid"]
+    assert [line.split()[0] for line in tasks.splitlines()[1:]] == [*TASKS]
     levels = tut("info", "levels").out
     assert [line.split()[0] for line in levels.splitlines()] == [
         "level", "none", "mild", "light", "moderate", "strong", "severe", "extreme",
@@ -217,7 +218,7 @@ def refused(said: Said) -> str:
         (["run", "Walker2d", "--bogus", "3"], "Unrecognized options: --bogus"),
         (["run", "Walker2d", "--robot", "3"], "--robots"),
         (["rnu", "Walker2d"], "rnu"),
-        ([], "{run, resume, evaluate, report, train-expert, check, info}"),
+        ([], "{run, resume, evaluate, report, reproduce, train-expert, check, info}"),
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
@@ -243,7 +244,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
     [
         (
             ["run", "Walkr2d"],
-            "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, "
+            "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, "
             "or your own as module:callable",
         ),
         (["run", "nowhere:make"], "task 'nowhere:make': no module 'nowhere'; install it, or run where Python finds it"),
@@ -295,7 +296,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
             "figure 2.3 has the tasks HalfCheetah, Walker2d, Ant; got Humanoid",
         ),
         (["reproduce", "figure-2.3", "--workers", "0"], "workers must be at least 1, got 0"),
-        (["train-expert", "Nope"], "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid"),
+        (["train-expert", "Nope"], "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion"),
         (["train-expert", "Walker2d", "--steps", "0"], "steps must be at least 1, got 0"),
         (
             ["train-expert", "Walker2d", "--ppo.rollout", "0"],

@@ -225,12 +225,11 @@ def _supervisor(task: str, level: str) -> list[str]:
         return ["none yet", "", ""]
     card = experts.load(task)[1]
     calm, here = card["scores"]["none"], card["scores"].get(level)
+    rate = f"{here['success']:.0%} of {here['episodes']}" if here else ""
+    if experts.program_of(task):
+        return ["program", f"{calm['mean']:.2f}", rate]
     kind = "expert" if experts.is_expert(card) else "short of expert"
-    return [
-        kind,
-        f"{calm['mean']:.0f} (published {experts.PUBLISHED[task]:.0f})",
-        f"{here['success']:.0%} of {here['episodes']}" if here else "",
-    ]
+    return [kind, f"{calm['mean']:.0f} (published {experts.PUBLISHED[task]:.0f})", rate]
 
 
 def _go(prepared: Run, tensorboard: bool) -> None:

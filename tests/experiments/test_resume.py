@@ -110,7 +110,7 @@ def test_a_run_killed_at_a_seeded_timestep_continues_bit_for_bit(
 
 
 def test_a_run_of_thrifty_dagger_keeps_its_running_moments(tmp_path: Path) -> None:
-    goal = {"task": "small:goal_fleet", "priority": "U.G.C."}
+    goal = {"task": "small:goal_fleet", "expert": "small:Reaching", "priority": "U.G.C."}
     Run.start(points(tmp_path / "whole", **goal)).run()
     killed(die_after, points(tmp_path / "killed", **goal), 17)
     assert resume(tmp_path / "killed") == 10

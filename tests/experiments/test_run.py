@@ -178,7 +178,7 @@ def test_a_fleet_of_ones_own_runs_with_every_priority(tmp_path: Path, priority: 
 
 
 def test_a_fleet_with_a_goal_runs_with_thrifty_dagger(tmp_path: Path) -> None:
-    run = Run.start(points(tmp_path / "run", task="small:goal_fleet", priority="U.G.C."))
+    run = Run.start(points(tmp_path / "run", task="small:goal_fleet", expert="small:Reaching", priority="U.G.C."))
     assert list(run.assembly.learner.critics) == ["goal"]
     assert run.run()["successes"] > 0
 

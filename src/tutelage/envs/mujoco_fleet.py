@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tutelage.envs.disturbance import Disturbance, Pusher, parse
 from tutelage.envs.engine import Physics, wait
 from tutelage.envs.tasks import TASKS
-from tutelage.envs.tasks.base import Array, MujocoTask
+from tutelage.envs.tasks.base import Array, GoalTask, MujocoTask
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet, Mask
 from tutelage.seeding import rng_state, set_rng_state
@@ -27,7 +27,7 @@ class MujocoFleet(Fleet):
         num_envs: N robots.
         disturbance: a level name, "name=value,..." or a `Disturbance`; default: the task's own level.
         success_return: the return an episode must reach, without violation, to be a success (section 5.6: 95 % of
-            the expert's). Default: reaching the horizon is enough.
+            the expert's). Default: reaching the horizon is enough. A `GoalTask` says itself what success is.
         threads: physics threads; default: all cores of the process.
     """
 
@@ -52,6 +52,7 @@ class MujocoFleet(Fleet):
         self.disturbance = parse(level) if isinstance(level, str) else level
         self.success_return = success_return
         self.horizon = task.horizon
+        self.goal_conditioned = isinstance(task, GoalTask)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.physics = Physics(
@@ -61,11 +62,14 @@ class MujocoFleet(Fleet):
         model = self.physics.model
         self.dt = float(model.opt.timestep) * task.frame_skip
         self.metadata = {**self.metadata, "render_modes": ["rgb_array"], "render_fps": round(1 / self.dt)}
-        weight = float(model.body_mass.sum()) * float(np.linalg.norm(model.opt.gravity))
+        own = model.body_rootid == model.body_rootid[model.body(task.push_body).id]
+        weight = float(np.where(own, model.body_mass, 0.0).sum()) * float(np.linalg.norm(model.opt.gravity))
         self._pusher = Pusher(self.disturbance, weight, self.dt, num_envs, task.planar)
         self._body_mass = np.tile(model.body_mass, (num_envs, 1))
 
         low, high = model.actuator_ctrlrange.astype(np.float32).T
+        if task.action_low is not None and task.action_high is not None:
+            low, high = task.action_low, task.action_high
         width = task.observe(self.physics.frame).shape[1]
         self.single_action_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), dtype=np.float64)
@@ -78,6 +82,7 @@ class MujocoFleet(Fleet):
         self._return = np.zeros(num_envs)
         self._position = np.zeros(num_envs)
         self._violation = np.zeros(num_envs, dtype=bool)
+        self._complete = np.zeros(num_envs, dtype=bool)
         self._obs = np.zeros((num_envs, width))
         self._renderers: dict[tuple[int, int], Any] = {}
         self._pending: Any = None
@@ -104,7 +109,7 @@ class MujocoFleet(Fleet):
             qpos, qvel = self.task.initial(self._rng, robots.size, self.physics.qpos0, self.physics.qvel0)
             self.physics.restart(robots, qpos, qvel)
             self._pusher.calm(mask)
-            self._elapsed[mask], self._return[mask], self._violation[mask] = 0, 0.0, False
+            self._elapsed[mask], self._return[mask], self._violation[mask], self._complete[mask] = 0, 0.0, False, False
             self._obs = np.where(mask[:, None], self.task.observe(self.physics.frame), self._obs)
             self._position = np.where(mask, self.task.forward(self.physics.frame, self._body_mass), self._position)
         return self._obs, {"violation": self._violation.copy(), "success": np.zeros(self.num_envs, dtype=bool)}
@@ -113,13 +118,15 @@ class MujocoFleet(Fleet):
         actions = np.asarray(actions, dtype=np.float64)
         if not self._seeded:
             raise ContractError("reset the fleet before its first step")
-        moving = ~self._violation if active is None else ~self._violation & active
+        moving = ~(self._violation | self._complete)
+        moving = moving if active is None else moving & active
         self.check_actions(actions, moving)
         ctrl = actions
         if self.disturbance.noise:
             half = (self.action_high - self.action_low) / 2
             ctrl = actions + self.disturbance.noise * half * self._rng.standard_normal(actions.shape)
             ctrl = np.clip(ctrl, self.action_low, self.action_high)
+        ctrl = self.task.control(self.physics.frame, np.where(moving[:, None], ctrl, 0.0))
         push = self._pusher.step(self._rng, moving) if self.disturbance.push else None
         futures = self.physics.advance_async(np.flatnonzero(moving), ctrl, push, self.task.frame_skip)
         self._pending = futures, moving, actions
@@ -139,7 +146,11 @@ class MujocoFleet(Fleet):
         self._elapsed += moving
         self._return += reward
         truncated = moving & (self._elapsed >= self.horizon) & ~self._violation
-        success = truncated & (self._elapsed == self.horizon) & (self._return >= self.success_return)
+        if isinstance(self.task, GoalTask):
+            success = moving & ~self._violation & self.task.success(frame)
+            self._complete = self._complete | success  # it stands still until it is reset
+        else:
+            success = truncated & (self._elapsed == self.horizon) & (self._return >= self.success_return)
         info = {
             "violation": self._violation.copy(),
             "success": success,
@@ -153,13 +164,13 @@ class MujocoFleet(Fleet):
         return tuple(self.render_robot(i) for i in range(self.num_envs)) if self.render_mode else None
 
     def render_robot(self, robot: int, width: int = 320, height: int = 240) -> NDArray[np.uint8]:
-        """A picture of one robot, (height, width, 3) uint8, from a camera that follows it."""
+        """A picture of one robot, (height, width, 3) uint8, from the task's camera or one that follows it."""
         from tutelage.envs.rendering import Renderer
 
         key = (width, height)
         if key not in self._renderers:
             torso = self.physics.model.body(self.task.push_body).id
-            self._renderers[key] = Renderer(self.physics.model, width, height, body=torso)
+            self._renderers[key] = Renderer(self.physics.model, width, height, body=torso, camera=self.task.camera)
         return self._renderers[key].picture(self.physics.datas[robot])  # type: ignore[no-any-return]
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -185,6 +196,7 @@ class MujocoFleet(Fleet):
             "return": self._return.copy(),
             "position": self._position.copy(),
             "violation": self._violation.copy(),
+            "complete": self._complete.copy(),
             "obs": self._obs.copy(),
             "push_left": self._pusher.left.copy(),
             "push_wrench": self._pusher.wrench.copy(),
@@ -199,6 +211,8 @@ class MujocoFleet(Fleet):
         self._return[:] = state["return"]
         self._position = state["position"].copy()
         self._violation = state["violation"].copy()
+        # Folders from before there were goals do not say it: nobody had reached one.
+        self._complete = np.array(state.get("complete", np.zeros(self.num_envs, dtype=bool)))
         self._obs = state["obs"].copy()
         self._pusher.left[:] = state["push_left"]
         self._pusher.wrench[:] = state["push_wrench"]

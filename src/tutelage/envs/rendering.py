@@ -89,7 +89,7 @@ def _close_all() -> None:
 
 
 class Renderer:
-    """Draws robots of one model, from the side, following the torso.
+    """Draws robots of one model, from the side, following the torso, or from a camera of the model.
 
     One renderer serves all robots that share a model, from one thread at a time and never during a step. The camera
     follows horizontally only, so that a fall is seen as one.
@@ -98,9 +98,10 @@ class Renderer:
         model: the `mjModel`.
         width, height: of the pictures, pixels.
         body: index of the body to follow.
+        camera: name of a camera of the model to use instead.
     """
 
-    def __init__(self, model: Any, width: int, height: int, body: int = 1) -> None:
+    def __init__(self, model: Any, width: int, height: int, body: int = 1, camera: str | None = None) -> None:
         if width < 1 or height < 1:
             raise ConfigError(f"a picture needs at least 1 x 1 pixels, got {width} x {height}")
         self._model, self._body = model, body
@@ -117,6 +118,8 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         self._camera.azimuth, self._camera.elevation = _AZIMUTH, _ELEVATION
+        if camera is not None:
+            self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
         self._gl = gl
         _open.add(self)
         self._offset, radius = _extent(model, body)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tutelage.cores import available_cores, default_torch_threads
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
-from tutelage.envs.registry import find_task, load_object, make_fleet
+from tutelage.envs.registry import find_task, make_fleet
 from tutelage.envs.tasks import TASKS
 from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError, ContractError
@@ -113,7 +113,7 @@ def assemble(config: RunConfig) -> Assembly:
             f"the expert {config.expert} sees {actor.features} numbers and gives {len(actor.low)} actions, "
             f"but {config.task} shows {width} and takes {actions}; train one with: tutelage train-expert {config.task}"
         )
-    if config.task in TASKS and isinstance(fleet, MujocoFleet):
+    if config.task in TASKS and isinstance(fleet, MujocoFleet) and not fleet.goal_conditioned:
         fleet.success_return = _success_return(config, actor)
     policy = EnsemblePolicy(
         width, fleet.action_low, fleet.action_high,
@@ -167,7 +167,11 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
 
 
 def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Array, Array]:
-    """Offline data of the human: obs (n, D) float32, actions (n, A). Whole episodes, one a robot; falls are left out."""
+    """Offline data of the human: obs (n, D) float32, actions (n, A). Whole episodes, one a robot; falls are left out.
+
+    Where there is a goal an episode ends with it, those that do not reach it are left out too, and robots demonstrate again
+    until there are pairs enough.
+    """
     wanted = config.offline_pairs or MujocoTask.offline_pairs
     episodes = max(1, round(wanted / horizon))
     length = min(horizon, -(-wanted // episodes))
@@ -176,24 +180,49 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
     disturbed = config.disturbance is not None or (isinstance(make, type) and issubclass(make, MujocoTask))
     level = config.offline_disturbance if disturbed else None  # a fleet of the user's own need not know levels
     fleet = make_fleet(config.task, spare, disturbance=level, threads=config.threads)
-    obs, _ = fleet.reset(seed=derive(config.seed, "demonstrations") % 2**32)
+    goal = fleet.goal_conditioned
+    seed: int | None = derive(config.seed, "demonstrations") % 2**32
+    pairs: list[tuple[Array, Array]] = []
+    while sum(len(seen) for seen, _ in pairs) < wanted:
+        obs, _ = fleet.reset(seed=seed)
+        seen, done, ends, failed = _episodes(fleet, actor, obs, horizon if goal else length)
+        good = np.flatnonzero(~failed)
+        if len(good) < (1 if goal else episodes):
+            what = "did not reach the goal" if goal else "fell"
+            raise ConfigError(f"the expert {what} in {int(failed.sum())} of {spare} demonstrations; choose a calmer level")
+        good = good if goal else good[:episodes]
+        pairs += [(seen[: ends[robot], robot], done[: ends[robot], robot]) for robot in good]
+        seed = None
+    fleet.close()
+    all_seen, all_done = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return all_seen[:wanted], all_done[:wanted]
+
+
+def _episodes(fleet: Fleet, actor: Policy, obs: Array, length: int) -> tuple[Array, Array, Array, Array]:
+    """One episode of the human on each robot, from `obs`, of at most so many timesteps.
+
+    Returns:
+        obs (T, N, D) float32, actions (T, N, A), the timesteps of each robot (N,), and whether it failed (N,).
+    """
+    ends = np.full(fleet.num_envs, length)
+    complete = np.zeros(fleet.num_envs, dtype=bool)
     seen, done = [], []
-    for _ in range(length):
+    for t in range(length):
         action = actor.act(obs)
         seen.append(obs.astype(np.float32))
         done.append(action)
         obs, _, _, _, info = fleet.step(action)
-    fleet.close()
-    (good,) = np.nonzero(~info["violation"])
-    if len(good) < episodes:
-        raise ConfigError(f"the expert fell in {spare - len(good)} of {spare} demonstrations; choose a calmer level")
-    keep = good[:episodes]
-    pairs = [np.stack(rows, axis=1)[keep].reshape(episodes * length, -1) for rows in (seen, done)]
-    return pairs[0][:wanted], pairs[1][:wanted]
+        if fleet.goal_conditioned:
+            ends[info["success"] & ~complete] = t + 1
+            complete = complete | info["success"]
+            if (complete | info["violation"]).all():
+                break
+    failed = ~complete if fleet.goal_conditioned else info["violation"]
+    return np.stack(seen), np.stack(done), ends, failed
 
 
 def _calibrate(assembly: Assembly, report: Report) -> dict[str, Any]:
-    """Run the cloned policy alone; a robot that falls starts again at once. Feeds the critics, returns what it felt."""
+    """Run the cloned policy alone; whoever falls or ends starts again at once. Feeds the critics, returns what it felt."""
     c, policy = assembly.config, assembly.policy
     fleet = assembly.fleet
     obs, _ = fleet.reset(seed=derive(c.seed, "calibration") % 2**32)
@@ -207,8 +236,9 @@ def _calibrate(assembly: Assembly, report: Report) -> dict[str, Any]:
             event = violation if name == "risk" else info["success"]
             critic.add(obs, actions, after, event, end=violation)
         obs = after
-        if (violation | truncated).any():
-            obs, _ = fleet.reset(options={"reset_mask": violation | truncated})
+        over = violation | truncated | info["success"]
+        if over.any():
+            obs, _ = fleet.reset(options={"reset_mask": over})
         report("the cloned policy alone", (t + 1) / c.calibration_steps)
     return {"uncertainty": np.concatenate(uncertainty), "visited": visited}
 
@@ -268,10 +298,7 @@ def _estimate(critic: Critic) -> Signal:
 def _expert(config: RunConfig) -> Policy:
     """The policy of the algorithmic humans."""
     if config.expert and ":" in config.expert and not Path(config.expert).exists():
-        policy = load_object(config.expert, "expert")()
-        if not isinstance(policy, Policy):
-            raise ContractError(f"expert {config.expert!r} must return a policy with act(obs), got {type(policy).__name__}")
-        return policy
+        return experts.run_program(config.expert)
     return experts.load(config.task, Path(config.expert) if config.expert else None)[0]
 
 

@@ -1,10 +1,14 @@
 """The shipped controllers that act as algorithmic supervisors, and what each scored.
 
-A controller is called an expert only if its mean return reaches the published expert's (see `PUBLISHED`).
+A controller is a file of trained weights, or a program that the task names (`MujocoTask.expert`). One with weights is called
+an expert only if its mean return reaches the published expert's (see `PUBLISHED`). The scores of a program are measured by
+
+    python -m tutelage.envs.experts.score PegInsertion
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +16,10 @@ from typing import Any
 import numpy as np
 
 from tutelage.envs.mujoco_fleet import MujocoFleet
+from tutelage.envs.registry import find_task, load_object, make_fleet
+from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError, ContractError
+from tutelage.fleet.policy import Policy
 from tutelage.policies.expert import GaussianActor
 from tutelage.seeding import derive
 
@@ -31,7 +38,7 @@ class Score:
         level: name of the disturbance.
         mean, sd: of the return over episodes; a fall ends an episode.
         survived: fraction of episodes without violation.
-        success: fraction that also reach `SUCCESS_FRACTION` of the mean.
+        success: fraction that also reach `SUCCESS_FRACTION` of the mean, or the goal of a task that has one.
         episodes: how many.
         seed: root seed of the evaluation.
     """
@@ -46,17 +53,32 @@ class Score:
 
 
 def path_of(task: str) -> Path:
-    """The file of the shipped controller of a task."""
-    return Path(__file__).parent / f"{task}.safetensors"
+    """The file of the shipped controller of a task: weights, or the scores of a program."""
+    return Path(__file__).parent / f"{task}.{'json' if program_of(task) else 'safetensors'}"
 
 
-def load(task: str, path: Path | None = None) -> tuple[GaussianActor, dict[str, Any]]:
-    """The controller of a task, and its card.
+def program_of(task: str) -> str | None:
+    """The program ("module:callable") that is the task's expert, if it has one.
+
+    Raises:
+        ConfigError: an unknown task.
+    """
+    found = find_task(task)
+    return found.expert if isinstance(found, type) and issubclass(found, MujocoTask) else None
+
+
+def load(task: str, path: Path | None = None) -> tuple[Policy, dict[str, Any]]:
+    """The controller of a task, and its card (without scores where nobody measured them).
 
     Raises:
         ConfigError: none is shipped for the task.
         ContractError: the file at `path` is for another task.
     """
+    program = program_of(task)
+    if path is None and program:
+        scores = path_of(task)
+        card = json.loads(scores.read_text()) if scores.exists() else {"task": task, "scores": {}}
+        return run_program(program), card
     path = path or path_of(task)
     if not path.exists():
         raise ConfigError(f"no expert at {path}; train one with: tutelage train-expert {task}")
@@ -66,25 +88,42 @@ def load(task: str, path: Path | None = None) -> tuple[GaussianActor, dict[str, 
     return actor, card
 
 
+def run_program(name: str) -> Policy:
+    """The policy that "module:callable" makes.
+
+    Raises:
+        ConfigError: no such callable.
+        ContractError: it does not make a policy.
+    """
+    policy = load_object(name, "expert")()
+    if not isinstance(policy, Policy):
+        raise ContractError(f"expert {name!r} must return a policy with act(obs), got {type(policy).__name__}")
+    return policy
+
+
 def is_expert(card: dict[str, Any]) -> bool:
     """Whether the controller reaches the published expert's return, undisturbed."""
     return float(card["scores"]["none"]["mean"]) >= PUBLISHED.get(card["task"], np.inf)
 
 
 def evaluate(
-    actor: GaussianActor, task: str, level: str, episodes: int = 100, seed: int = 1_000_000, threads: int | None = None
+    actor: Policy, task: str, level: str, episodes: int = 100, seed: int = 1_000_000, threads: int | None = None
 ) -> Score:
     """Run a controller for one episode on each of `episodes` robots. The seed is one that no training uses."""
-    fleet = MujocoFleet(task, episodes, disturbance=level, threads=threads)
+    fleet = make_fleet(task, episodes, disturbance=level, threads=threads)
+    if not isinstance(fleet, MujocoFleet):
+        raise ConfigError(f"{task} has no levels of disturbance to score an expert at")
     obs, info = fleet.reset(seed=derive(seed, f"evaluate expert/{level}") % 2**32)
+    complete = info["success"]
     for _ in range(fleet.horizon):
         obs, _, _, _, info = fleet.step(actor.act(obs))
-        if info["violation"].all():
+        complete = complete | info["success"]
+        if (info["violation"] | complete).all():
             break
     fleet.close()
     total, survived = info["return"], ~info["violation"]
     mean = float(total.mean())
-    success = survived & (total >= SUCCESS_FRACTION * mean)
+    success = complete if fleet.goal_conditioned else survived & (total >= SUCCESS_FRACTION * mean)
     return Score(level, mean, float(total.std()), float(survived.mean()), float(success.mean()), episodes, seed)
 
 
