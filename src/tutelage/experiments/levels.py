@@ -17,6 +17,7 @@ import tyro
 from tyro.conf import Positional
 
 from tutelage.envs import experts
+from tutelage.envs.rollout import rollout
 from tutelage.envs.tasks import TASKS
 from tutelage.experiments.assemble import assemble, prepare
 from tutelage.experiments.config import RunConfig
@@ -72,13 +73,9 @@ def behaviour_cloning(config: LevelsConfig, level: str) -> dict[str, float]:
     )
     assembly = prepare(assemble(run))
     fleet, policy = assembly.fleet, assembly.policy
-    obs, info = fleet.reset(seed=derive(config.seed, "levels") % 2**32)
-    complete = info["success"]
-    for _ in range(fleet.horizon):
-        obs, _, _, _, info = fleet.step(policy.act(obs))
-        complete = complete | info["success"]
+    episodes = rollout(fleet, policy, derive(config.seed, "levels") % 2**32)
     fleet.close()
-    return {"success": float(complete.mean()), "survived": float((~info["violation"]).mean())}
+    return {"success": float(episodes.succeeded.mean()), "survived": float(episodes.survived.mean())}
 
 
 def measure(config: LevelsConfig) -> list[dict[str, object]]:

@@ -6,46 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import make_fleet
+from tutelage.envs.rollout import rollout
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.policy import Policy
 from tutelage.fleet.step import Step
 from tutelage.seeding import derive
 from tutelage.store import write_atomic
-
-
-def rollout(config: RunConfig, policy: Policy, episodes: int, name: str) -> dict[str, Any]:
-    """One episode of the policy on each of some robots of the run's task; a fall ends an episode.
-
-    Args:
-        config: task, disturbance and seed are taken from it.
-        policy: acts for all robots.
-        episodes: how many, side by side.
-        name: of the random stream.
-
-    Returns:
-        return_mean, return_sd (over episodes), survived and succeeded (fractions).
-    """
-    fleet = make_fleet(config.task, episodes, disturbance=config.disturbance, threads=config.threads)
-    obs, info = fleet.reset(seed=derive(config.seed, name) % 2**32)
-    total, running = np.zeros(episodes), np.ones(episodes, dtype=bool)
-    succeeded = np.zeros(episodes, dtype=bool)
-    for _ in range(fleet.horizon):
-        obs, reward, _, truncated, info = fleet.step(policy.act(obs))
-        total += np.where(running, reward, 0.0)
-        succeeded |= running & info["success"] & ~info["violation"]
-        running &= ~(info["violation"] | info["success"] | truncated)
-        if not running.any():
-            break
-    survived = float((~info["violation"]).mean())
-    fleet.close()
-    return {
-        "return_mean": float(total.mean()), "return_sd": float(total.std()), "survived": survived,
-        "succeeded": float(succeeded.mean()),
-    }  # fmt: skip
 
 
 class TestRollouts:
@@ -77,5 +45,18 @@ class TestRollouts:
         epoch, rest = divmod(loop.t, self.every)
         if rest == 0:
             # A resumed run tests an epoch again where it was interrupted, on the same stream: the same numbers.
-            self.scores[str(epoch)] = rollout(self.config, loop.policy, self.episodes, f"test rollouts/{epoch}")
+            self.scores[str(epoch)] = self._score(loop, derive(self.config.seed, f"test rollouts/{epoch}") % 2**32)
             write_atomic(self.path, json.dumps(self.scores, indent=1).encode())
+
+    def _score(self, loop: Loop, seed: int) -> dict[str, float]:
+        c = self.config
+        rule = {"success_return": loop.fleet.success_return} if isinstance(loop.fleet, MujocoFleet) else {}
+        fleet = make_fleet(c.task, self.episodes, disturbance=c.disturbance, threads=c.threads, **rule)
+        episodes = rollout(fleet, loop.policy, seed)
+        fleet.close()
+        return {
+            "return_mean": float(episodes.returns.mean()),
+            "return_sd": float(episodes.returns.std()),
+            "survived": float(episodes.survived.mean()),
+            "succeeded": float(episodes.succeeded.mean()),
+        }

@@ -17,6 +17,7 @@ import numpy as np
 
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import find_task, load_object, make_fleet
+from tutelage.envs.rollout import rollout
 from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.policy import Policy
@@ -113,17 +114,11 @@ def evaluate(
     fleet = make_fleet(task, episodes, disturbance=level, threads=threads)
     if not isinstance(fleet, MujocoFleet):
         raise ConfigError(f"{task} has no levels of disturbance to score an expert at")
-    obs, info = fleet.reset(seed=derive(seed, f"evaluate expert/{level}") % 2**32)
-    complete = info["success"]
-    for _ in range(fleet.horizon):
-        obs, _, _, _, info = fleet.step(actor.act(obs))
-        complete = complete | info["success"]
-        if (info["violation"] | complete).all():
-            break
+    episodes_of = rollout(fleet, actor, derive(seed, f"evaluate expert/{level}") % 2**32)
     fleet.close()
-    total, survived = info["return"], ~info["violation"]
+    total, survived = episodes_of.returns, episodes_of.survived
     mean = float(total.mean())
-    success = complete if fleet.goal_conditioned else survived & (total >= SUCCESS_FRACTION * mean)
+    success = episodes_of.succeeded if fleet.goal_conditioned else survived & (total >= SUCCESS_FRACTION * mean)
     return Score(level, mean, float(total.std()), float(survived.mean()), float(success.mean()), episodes, seed)
 
 
