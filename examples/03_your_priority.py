@@ -9,8 +9,9 @@ import numpy as np
 
 from tutelage.checks import check_priority
 from tutelage.envs.registry import make_fleet
-from tutelage.experiments.assemble import assemble, prepare
+from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
+from tutelage.experiments.prepare import prepare
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.priority import Priority, parse
 from tutelage.fleet.supervisor import PolicySupervisor, Team

@@ -17,8 +17,9 @@ from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.tasks import TASKS, GoalTask, arm
 from tutelage.envs.tasks.peg_insertion import OPEN, PEG, PEG_HEIGHT, STEP, TABLE, TWIST
 from tutelage.errors import ConfigError, TutelageError
-from tutelage.experiments.assemble import assemble, demonstrations
+from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import ExpertConfig, RunConfig
+from tutelage.experiments.prepare import demonstrations
 from tutelage.experiments.train_expert import train
 
 GRIP, HEADING, FINGER, RING, HANDLE, AXIS = slice(18, 21), slice(21, 23), 23, slice(25, 28), slice(28, 31), slice(31, 34)

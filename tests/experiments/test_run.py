@@ -14,8 +14,10 @@ from small import assert_same, contents, edit_config, points, walker
 from tutelage.envs import experts
 from tutelage.errors import ConfigError, ContractError, RunFolderError, TutelageError
 from tutelage.experiments import assemble as assembling
-from tutelage.experiments.assemble import assemble, demonstrations, prepare
+from tutelage.experiments import prepare as preparing
+from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import FORMAT, RunConfig, from_json, to_json
+from tutelage.experiments.prepare import demonstrations, prepare
 from tutelage.experiments.run import Run, read_config
 from tutelage.fleet.priority import PriorityConfig
 from tutelage.policies.ensemble import EnsemblePolicy
@@ -70,6 +72,18 @@ def test_a_threshold_that_is_given_is_kept(tmp_path: Path) -> None:
     thresholds = run.config.thresholds
     assert (thresholds.risk, thresholds.initial) == (0.125, 3)
     assert thresholds.uncertainty is not None
+
+
+def test_missed_falls_can_be_bounded_instead(tmp_path: Path) -> None:
+    thresholds = [
+        Run.start(
+            walker(tmp_path / str(missed), calibration_steps=60, thresholds=PriorityConfig(missed=missed))
+        ).config.thresholds
+        for missed in (0.2, 0.6)
+    ]
+    assert all(t.risk is not None for t in thresholds)
+    assert 0 <= (thresholds[0].risk or 0) <= (thresholds[1].risk or 0)
+    assert thresholds[1].risk
 
 
 def test_preparation_is_reported(tmp_path: Path) -> None:
@@ -226,7 +240,7 @@ def test_an_expert_of_the_wrong_shape_is_refused(tmp_path: Path, features: int, 
 def test_refusals_come_first_and_leave_no_folder(
     tmp_path: Path, changes: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(assembling, "demonstrations", lambda *args: pytest.fail("minutes are spent"))
+    monkeypatch.setattr(preparing, "demonstrations", lambda *args: pytest.fail("minutes are spent"))
     with pytest.raises(TutelageError, match=message):
         Run.start(walker(tmp_path / "run", **changes))
     assert not (tmp_path / "run").exists()
@@ -238,7 +252,7 @@ def test_latency_needs_a_fleet_that_can_pause_and_that_is_said_first(
     from fakes import PointFleet
 
     monkeypatch.setattr("small.point_fleet", lambda num_envs: PointFleet(num_envs, can_pause=False))
-    monkeypatch.setattr(assembling, "demonstrations", lambda *args: pytest.fail("minutes are spent"))
+    monkeypatch.setattr(preparing, "demonstrations", lambda *args: pytest.fail("minutes are spent"))
     with pytest.raises(ConfigError, match="switching latency needs a fleet that can pause robots"):
         Run.start(points(tmp_path / "run", latency=1))
 
@@ -247,7 +261,7 @@ def test_a_fleet_that_cannot_be_saved_is_refused_first(tmp_path: Path, monkeypat
     from fakes import PointFleet
 
     monkeypatch.setattr(PointFleet, "can_checkpoint", False)
-    monkeypatch.setattr(assembling, "demonstrations", lambda *args: pytest.fail("minutes are spent"))
+    monkeypatch.setattr(preparing, "demonstrations", lambda *args: pytest.fail("minutes are spent"))
     with pytest.raises(ConfigError, match="small:point_fleet cannot be checkpointed, and a run must be"):
         Run.start(points(tmp_path / "run"))
     assert not (tmp_path / "run").exists()

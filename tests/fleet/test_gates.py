@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -122,6 +123,22 @@ def test_thrifty_thresholds_are_quantiles_of_autonomous_states_after_each_episod
         assert gate.thresholds == pytest.approx(exact, rel=0.0011)
 
 
+def test_the_budget_may_change_in_time() -> None:
+    config = GateConfig(alpha=0.2, alpha_end=0.1, alpha_over=100)
+    assert [config.budget(t) for t in (0, 50, 100, 900)] == pytest.approx([0.2, 0.15, 0.1, 0.1])
+    gate, rng = (
+        ThriftyDAgger(dataclasses.replace(THRIFTY, alpha=0.2, alpha_end=0.1, alpha_over=100)),
+        np.random.default_rng(0),
+    )
+    thresholds = []
+    for t in (0, 200):
+        gate(
+            make_view(t, violation=(False,) * 5000, uncertainty=rng.random(5000), goal=rng.random(5000), fresh=[True] * 5000)
+        )
+        thresholds.append(gate.thresholds["delta_h"])
+    assert thresholds == pytest.approx([0.8, 0.9], abs=0.02)
+
+
 def test_thrifty_continues_after_a_round_trip_of_its_state() -> None:
     gate, rng = ThriftyDAgger(THRIFTY), np.random.default_rng(1)
     views = [make_view(t, fresh=[t % 7 == 0] * 4, uncertainty=rng.random(4), goal=rng.random(4)) for t in range(60)]
@@ -207,7 +224,7 @@ def test_a_gate_without_its_numbers_says_so(name: str) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"alpha": 0.0}, "alpha must be between 0 and 1"), ({"alpha": 1.0}, "alpha"), ({"beta_r": 1.0}, "below 1"),
+        ({"alpha": 0.0}, "alpha must be between 0 and 1"), ({"alpha": 1.0}, "alpha"), ({"alpha_end": 0.0}, "alpha_end"), ({"beta_r": 1.0}, "below 1"),
         ({"beta_r": 0.0}, "above 0"), ({"beta_h": np.nan}, "beta_h"), ({"noise": -1.0}, "noise"), ({"span": 0}, "span"),
         ({"risk_ask": 0.2, "risk_cede": 0.3}, "must not exceed"), ({"without": "novelties"}, "novelty or risk"),
     ],

@@ -19,8 +19,9 @@ from tyro.conf import Positional
 from tutelage.envs import experts
 from tutelage.envs.rollout import rollout
 from tutelage.envs.tasks import TASKS
-from tutelage.experiments.assemble import assemble, prepare
+from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
+from tutelage.experiments.prepare import prepare
 from tutelage.seeding import derive
 from tutelage.store import write_atomic
 

@@ -12,8 +12,9 @@ from typing import Any, TextIO
 
 import tutelage
 from tutelage.errors import ConfigError, ContractError, RunFolderError
-from tutelage.experiments.assemble import Assembly, assemble, prepare
+from tutelage.experiments.assemble import Assembly, assemble
 from tutelage.experiments.config import FORMAT, RunConfig, from_json, to_json
+from tutelage.experiments.prepare import prepare
 from tutelage.experiments.recording import Recorder, lock
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.step import Step, Subscriber

@@ -55,6 +55,8 @@ class PriorityConfig:
         risk: r-hat, likewise; None: from `risk_quantile`.
         uncertainty_quantile: quantile of the uncertainty over the policy's own first steps that becomes u-hat.
         risk_quantile: likewise for r-hat.
+        missed: in place of `risk_quantile`: fraction of falls of the cloned policy that may come without its risk having
+            been above r-hat in the 10 timesteps before (a conformal bound, on average over calibrations).
         initial: t_I, timesteps at the start during which constraint violations have no priority; None: what the
             task and the priority decide (only C.U.R. has such a period).
         combined: threshold of the combined score of U.G.
@@ -66,6 +68,7 @@ class PriorityConfig:
     risk: float | None = None
     uncertainty_quantile: float = 0.9
     risk_quantile: float = 0.99
+    missed: float | None = None
     initial: int | None = None
     combined: float = 3.25
     goal_weight: float = 0.25
@@ -79,6 +82,8 @@ class PriorityConfig:
         for name in ("uncertainty_quantile", "risk_quantile"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if self.missed is not None and not 0 < self.missed < 1:
+            raise ConfigError(f"missed must be between 0 and 1, got {self.missed}")
         if self.initial is not None and self.initial < 0:
             raise ConfigError(f"initial (t_I) must be >= 0 timesteps, got {self.initial}")
 

@@ -31,6 +31,8 @@ class GateConfig:
         ask_again: give control back by the classifier alone, LazyDAgger (-Switch to Auto).
         noise: sigma^2 that LazyDAgger injects into the human's actions, in units of half the action range; 0: (-Noise).
         alpha: alpha_h of ThriftyDAgger: the desired fraction of timesteps with a request. In (0, 1).
+        alpha_end: alpha_h after `alpha_over` timesteps, reached in a straight line from alpha; None: alpha_h stays.
+        alpha_over: how long that takes.
         without: a signal that ThriftyDAgger is to do without, "novelty" or "risk" (its two ablations).
         novelty: delta_h with which ThriftyDAgger begins; None: from the first steps of the cloned policy.
         risk_ask: likewise beta_H.
@@ -51,6 +53,8 @@ class GateConfig:
     ask_again: bool = False
     noise: float = 0.1
     alpha: float = 0.01
+    alpha_end: float | None = None
+    alpha_over: int = 10_000
     without: str | None = None
     novelty: float | None = None
     risk_ask: float | None = None
@@ -69,8 +73,8 @@ class GateConfig:
             value = getattr(self, name)
             if value is not None and not 0 <= value < np.inf:
                 raise ConfigError(f"gate {name} must be a number >= 0, got {value}")
-        for name in ("unsafe", "alpha"):
-            if not 0 < getattr(self, name) < 1:
+        for name in ("unsafe", "alpha", "alpha_end"):
+            if getattr(self, name) is not None and not 0 < getattr(self, name) < 1:
                 raise ConfigError(f"gate {name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 < self.beta_r < 1:
             raise ConfigError(f"gate beta_r (beta_R / beta_H) must be above 0 and below 1, got {self.beta_r}")
@@ -80,9 +84,15 @@ class GateConfig:
             raise ConfigError(f"ThriftyDAgger can do without novelty or risk, not without {self.without!r}")
         if not 0 <= self.noise < np.inf or not 0 <= self.beta <= 1:
             raise ConfigError(f"gates need noise >= 0 and beta in [0, 1], got {self.noise} and {self.beta}")
-        for name in ("history", "reaction", "span", "dwell", "epoch"):
+        for name in ("alpha_over", "history", "reaction", "span", "dwell", "epoch"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"gate {name} must be at least 1, got {getattr(self, name)}")
+
+    def budget(self, t: int) -> float:
+        """alpha_h at timestep t."""
+        if self.alpha_end is None:
+            return self.alpha
+        return self.alpha + (self.alpha_end - self.alpha) * min(1.0, t / self.alpha_over)
 
 
 class Gate(ABC):

@@ -65,7 +65,7 @@ class ThriftyDAgger(Gate):
         self.taught += len(taught)
         self.discrepancy += float(taught.sum())
         if view.fresh.any() and len(self.novelty) >= self.config.history:
-            q = 1 - self.config.alpha
+            q = 1 - self.config.budget(view.t)
             self.thresholds["delta_h"], self.thresholds["beta_h"] = self.novelty.quantile(q), self.risk.quantile(q)
             self.thresholds["beta_r"] = self.risk.quantile(0.5)
             if self.taught:
