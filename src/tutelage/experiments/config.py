@@ -40,6 +40,8 @@ class RunConfig:
         t_reset: t_R, timesteps of a hard reset.
         latency: L, timesteps between an assignment and its beginning; the robot waits.
         disturbance: level of the world's disturbances; default: the task's own.
+        success_return: the return that makes an episode of a task without a goal a success; default: 95 % of the expert's
+            at this level.
         offline_pairs: state-action pairs of the human before the run, in whole episodes of the supervisor; default:
             the task's own.
         offline_disturbance: level of disturbance while those were recorded (demonstrations are given in calm).
@@ -75,6 +77,7 @@ class RunConfig:
     t_reset: int = 5
     latency: int = 0
     disturbance: str | None = None
+    success_return: float | None = None
     offline_pairs: int | None = None
     offline_disturbance: str = "none"
     calibration_steps: int = 200
@@ -105,6 +108,8 @@ class RunConfig:
             raise ConfigError(f"{self.humans} humans for {self.robots} robots: use at most one human a robot (M <= N)")
         if not 0 <= self.supervisor_noise < math.inf:
             raise ConfigError(f"supervisor_noise must be a number >= 0, got {self.supervisor_noise}")
+        if self.success_return is not None and not math.isfinite(self.success_return):
+            raise ConfigError(f"success_return must be a number, got {self.success_return}")
         if min(self.hidden, default=1) < 1:
             raise ConfigError(f"hidden layers must be at least 1 wide, got {self.hidden}")
         if self.record not in ("human", "all", "none"):

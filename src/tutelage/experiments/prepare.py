@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.envs.registry import find_task, make_fleet
+from tutelage.envs.registry import make_fleet
 from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError
 from tutelage.experiments.assemble import Assembly
@@ -72,9 +72,8 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
     episodes = max(1, round(wanted / horizon))
     length = min(horizon, -(-wanted // episodes))
     spare = episodes + 2 + episodes // 4  # the human repeats a demonstration that failed
-    make = find_task(config.task)
-    disturbed = config.disturbance is not None or (isinstance(make, type) and issubclass(make, MujocoTask))
-    level = config.offline_disturbance if disturbed else None  # a fleet of the user's own need not know levels
+    # A fleet of the user's own need not know levels; a run on one that does has a level by now.
+    level = None if config.disturbance is None else config.offline_disturbance
     fleet = make_fleet(config.task, spare, disturbance=level, threads=config.threads)
     goal = fleet.goal_conditioned
     seed: int | None = derive(config.seed, "demonstrations") % 2**32
