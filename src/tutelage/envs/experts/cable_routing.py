@@ -1,4 +1,4 @@
-"""The algorithmic human for cable routing: a program that sees how the cable lies and knows which way round is left to go."""
+"""The algorithmic human for cable routing: a program that sees how the cable lies and knows which way to go round next."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def crossings(start: Array, end: Array) -> NDArray[np.int64]:
     y = start[..., None, 1] + part * (end[..., None, 1] - start[..., None, 1])
     side = np.sign(PEGS[:, 1])
     beyond = (y - PEGS[:, 1]) * side > 0
-    return np.where((before != after) & beyond, side * np.where(after, 1, -1), 0).astype(np.int64)  # type: ignore[no-any-return]
+    return np.where((before != after) & beyond, side * np.where(after, 1, -1), 0).astype(np.int64)
 
 
 def _sheet(rounds: Array) -> NDArray[np.intp]:

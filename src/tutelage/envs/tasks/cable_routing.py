@@ -1,6 +1,6 @@
-"""Cable routing: a gripper draws a cable around four pegs into a figure 8; violation: the cable left the table.
+"""Cable routing: a gripper draws a cable around four pegs into a figure 8; violation: its free end was drawn in.
 
-The cable routing of ThriftyDAgger (section 3.5, appendix B.3 of the dissertation), there on a surgical robot, here simulated.
+The cable routing of ThriftyDAgger (section 3.5, appendix B.3 of the dissertation), where a surgical robot did it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class CableRouting(GoalTask):
     to the free end (29 times x, y, m).
 
     Actions: steps of the gripper along x and y. A step that would end in a logical obstacle ends on its border instead.
-    Violation: the cable is no longer on the table. Goal: the cable lies in a figure 8, see `figure_eight`.
+    Violation: the free end of the cable is among the pegs, where too little of it is left, or the cable left the table.
+    Goal: the cable lies in a figure 8, see `figure_eight`.
     """
 
     name, xml, frame_skip = "CableRouting", "cable_routing.xml", 20
@@ -49,7 +50,7 @@ class CableRouting(GoalTask):
     offline_pairs = 1381
     expert = "tutelage.envs.experts.cable_routing:CableRouter"
     action_low, action_high = (-np.ones(2, dtype=np.float32), np.ones(2, dtype=np.float32))
-    summary = "a gripper draws a cable around four pegs into a figure 8; violation: the cable left the table"
+    summary = "a gripper draws a cable around four pegs into a figure 8; violation: its free end was drawn in"
 
     def control(self, frame: Frame, actions: Array) -> Array:
         # From where the gripper is, not from where it was told to be: what pulls at a taut cable does not wind up.
@@ -68,7 +69,8 @@ class CableRouting(GoalTask):
         cable = frame["xpos"][:, 2:]
         inside = (cable[..., :2] > TABLE[0]) & (cable[..., :2] < TABLE[1])
         on_table = inside.all(axis=2) & (np.abs(cable[..., 2]) < 0.02)
-        return ~on_table.all(axis=1)  # type: ignore[no-any-return]
+        drawn_in = (np.abs(cable[:, -1, :2]) < REACH).all(axis=1)
+        return np.asarray(drawn_in | ~on_table.all(axis=1))
 
     def initial(self, rng: np.random.Generator, n: int, qpos0: Array, qvel0: Array) -> tuple[Array, Array]:
         qpos = np.tile(qpos0, (n, 1))
@@ -107,7 +109,7 @@ def figure_eight(path: Array) -> NDArray[np.bool_]:
     around = turns(path)
     upper, lower = around[:, _UPPER], around[:, _LOWER]
     whole = ((upper >= 1) & (lower <= -1)).all(axis=1) | ((upper <= -1) & (lower >= 1)).all(axis=1)
-    return whole & ~splits(path[:, :-1], path[:, 1:]).any(axis=1)  # type: ignore[no-any-return]
+    return np.asarray(whole & ~splits(path[:, :-1], path[:, 1:]).any(axis=1))
 
 
 def splits(start: Array, end: Array) -> NDArray[np.bool_]:
@@ -124,7 +126,7 @@ def _x_at(start: Array, end: Array, height: float) -> Array:
     below, above = start[..., 1] - height, end[..., 1] - height
     crosses = (below < 0) != (above < 0)
     part = below / np.where(crosses, below - above, 1.0)
-    return np.where(crosses, start[..., 0] + part * (end[..., 0] - start[..., 0]), np.nan)  # type: ignore[no-any-return]
+    return np.where(crosses, start[..., 0] + part * (end[..., 0] - start[..., 0]), np.nan)
 
 
 def _cable(frame: Frame) -> Array:
