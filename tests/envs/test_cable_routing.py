@@ -11,7 +11,7 @@ import pytest
 
 from tutelage.checks import check_env, check_policy
 from tutelage.envs import experts
-from tutelage.envs.experts.cable_routing import CableRouter, crossings, way
+from tutelage.envs.experts.cable_routing import CableRouter, stages, way
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import make_fleet
 from tutelage.envs.tasks import TASKS, GoalTask
@@ -78,13 +78,9 @@ CLOSED = [(-1, 0.3), (1, 0.3)]
     [
         pytest.param([*UPPER, *LOWER, *CLOSED], True, id="figure eight"),
         pytest.param([(x, -y) for x, y in [*UPPER, *LOWER, *CLOSED]], True, id="lower loop first"),
-        pytest.param(
-            [(-9, 0), (-3, 1), (-3, 3), (3, 3), (3, 1), (0, 0), (-3, -1), (-3, -3), (3, -3), (3, -1), (0, 0.3), (-4, 0.5)],
-            True,
-            id="the other way round",
-        ),
+        pytest.param([(-x, y) for x, y in [*UPPER, *LOWER, *CLOSED]], True, id="from the right"),
         pytest.param([*UPPER, (3, 0), *UPPER[2:], *LOWER, *CLOSED], True, id="twice around the upper pegs"),
-        pytest.param([*UPPER, *LOWER], False, id="not closed"),
+        pytest.param([*UPPER, *LOWER[:-1], (-3, -2.5)], False, id="not closed"),
         pytest.param([*UPPER, *LOWER[:3]], False, id="half of the lower loop"),
         pytest.param([*UPPER, (0, 0)], False, id="one loop"),
         pytest.param([(-9, 0), (-3, -3), (3, -3), (3, 3), (-3, 3), (-3, -3), (0, -4)], False, id="one loop around all"),
@@ -149,15 +145,20 @@ def test_success_ends_the_episode_with_reward_one() -> None:
 
 
 def test_a_step_into_a_logical_obstacle_ends_at_the_nearest_point_of_its_border() -> None:
-    points = np.array([[0.02, 0.025], [0.02 - 0.003, 0.02 - 0.004], [-0.02, -0.02], [0.0, 0.0], [0.02, 0.0305]])
-    expected = np.array([[0.02, 0.03], [0.02 - 0.006, 0.02 - 0.008], [-0.01, -0.02], [0.0, 0.0], [0.02, 0.0305]])
-    np.testing.assert_allclose(project(points), expected, atol=1e-12)
+    start = np.array([[0.02, 0.032], [0.01, 0.01], [0.01, 0.0], [0.02, 0.035], [0.01, 0.02], [0.02, -0.01]])
+    end = np.array([[0.02, 0.025], [0.017, 0.016], [0.0, 0.0], [0.02, 0.0305], [0.023, 0.022], [0.0201, -0.025]])
+    side = 0.01 * np.sqrt(0.75)
+    expected = [[0.02, 0.03], [0.014, 0.012], [0, 0], [0.02, 0.0305], [0.015, 0.02 + side], [0.02 + side, -0.015]]
+    np.testing.assert_allclose(project(start, end), np.array(expected), atol=1e-12)
+    middle = project(np.array([[-0.02, -0.005]]), np.array([[-0.02, -0.02]]))
+    assert np.linalg.norm(middle - PEGS[2]) == pytest.approx(KEEP_OUT), "which has no nearest point"
 
 
 def test_commands_are_one_centimetre_at_most_inside_the_workspace_and_outside_the_obstacles() -> None:
     rng, task = np.random.default_rng(0), CableRouting()
     frame = {"xpos": np.zeros((500, 2 + LINKS, 3))}
-    gripper = project(rng.uniform(-REACH, REACH, (500, 2)))
+    anywhere = rng.uniform(-REACH, REACH, (500, 2))
+    gripper = project(anywhere, anywhere)
     frame["xpos"][:, 2, :2] = gripper
     commands = task.control(frame, rng.uniform(-1, 1, (500, 2)))
     assert (np.abs(commands) <= REACH).all()
@@ -191,7 +192,7 @@ def test_the_gripper_slides_around_the_obstacles_and_never_enters_them(cables: M
         gaps = np.linalg.norm(obs[:, 2:10].reshape(4, 4, 2), axis=2)
         nearest, before = min(nearest, gaps.min()), obs
     assert KEEP_OUT - 0.0005 < nearest < KEEP_OUT + 0.0005
-    assert max(steps) < 1.1 * STEP
+    assert max(steps) < 1.3 * STEP, "to the border it may be a little more"
 
 
 # -- the cable ------------------------------------------------------------------------------------------------------
@@ -217,7 +218,7 @@ def test_the_cable_starts_in_about_the_same_shape_outside_the_workspace() -> Non
     cable = cable_of(fleet.reset(seed=0)[0])
     assert (np.abs(cable[:, 0] - START) <= 0.0031).all()
     assert (cable[:, 2:, 0] < -REACH).all()
-    assert 0.0005 < cable[:, 5].std(axis=0).min()
+    assert cable[:, 5].std(axis=0).min() > 0.0005
     assert cable[:, -1].std(axis=0).max() < 0.08
     np.testing.assert_allclose(np.linalg.norm(np.diff(cable, axis=1), axis=2), LINK)
     fleet.close()
@@ -307,10 +308,7 @@ def test_the_human_takes_back_what_was_laid_wrong() -> None:
     for corners in zip(*(w + w[-1:] * (3 - len(w)) for w in wrong), strict=True):
         for _ in range(8):
             obs = fleet.step(np.clip((np.array(corners) / 100 - obs[:, :2]) / STEP, -1, 1))[0]
-    cable = cable_of(obs)
-    rounds = crossings(cable[:, 1:], cable[:, :-1]).sum(axis=1)
-    assert rounds[0, 0] == -1, "the wrong way round"
-    assert splits(cable[1:2, 1:], cable[1:2, :-1]).any()
+    assert stages(cable_of(obs)[:, ::-1]).tolist() == [7, 10, 11, 5], "each has crossed what the figure does not"
     _, complete, _ = work(fleet, obs, 150)
     assert complete.all()
     fleet.close()
@@ -320,16 +318,27 @@ def test_the_map_knows_a_way_from_everywhere_outside_the_obstacles() -> None:
     left = way()
     free = np.isfinite(left[0])
     assert 0.7 < free.mean() < 1
-    assert (np.isfinite(left) == free).all()
-    assert left.min() == 0
-    start = left[40, 3, 13]  # no round yet, at (-3.8, 0.2) cm
-    assert 0.3 < start < 0.45, "about 37 cm, as long as the cable must be"
+    for stage in (0, 1, 2, 3, *range(4, 8), *range(9, 13)):
+        assert np.array_equal(np.isfinite(left[stage]), free)
+    start = left[0, 3, 13]  # nothing done yet, at (-3.8, 0.2) cm
+    assert 0.33 < start < 0.45, "about 38 cm: longer than the cable, but it takes short cuts at the pegs"
 
 
-def test_rounds_are_turns_up_to_one() -> None:
-    whole = path(*UPPER, *LOWER, *CLOSED)
-    assert crossings(whole[:, :-1], whole[:, 1:]).sum(axis=1).tolist() == [[1, 1, -1, -1]]
-    assert crossings(whole[:, 1:], whole[:, :-1]).sum(axis=1).tolist() == [[-1, -1, 1, 1]]
+def test_the_human_knows_what_is_next_from_how_the_cable_lies() -> None:
+    cases = [
+        ([], 0),
+        (UPPER, 1),
+        ([(x, -y) for x, y in UPPER], 2),
+        ([*UPPER, *LOWER], 3),
+        ([(x, -y) for x, y in [*UPPER, *LOWER, *CLOSED]], 3),
+        ([(0, 0), (0, 3)], 8 + 2),  # up between the upper pair
+        ([(0, 0), (0, 3), (0, 1)], 0),  # and back again
+        ([(-3, 1), (-3, 3), (0, 3)], 8 - 1),  # over the upper pegs from the left
+        ([*UPPER, *UPPER[1:]], 8 + 1),  # once more than wanted
+        ([*UPPER, (0, 0), (0, -3)], 8 - 4),
+    ]
+    for corners, stage in cases:
+        assert stages(path((-9, 0), (-4, 0), *corners)).tolist() == [stage]
 
 
 def test_the_human_looks_at_each_row_alone(cables: MujocoFleet) -> None:

@@ -46,7 +46,7 @@ class CableRouting(GoalTask):
     fields = ("xpos",)
     push_body, camera = "link 6", "fixed"
     horizon = 100
-    disturbance = "moderate"
+    disturbance = "severe"
     offline_pairs = 1381
     expert = "tutelage.envs.experts.cable_routing:CableRouter"
     action_low, action_high = (-np.ones(2, dtype=np.float32), np.ones(2, dtype=np.float32))
@@ -54,7 +54,8 @@ class CableRouting(GoalTask):
 
     def control(self, frame: Frame, actions: Array) -> Array:
         # From where the gripper is, not from where it was told to be: what pulls at a taut cable does not wind up.
-        return project(np.clip(_cable(frame)[:, 0] + STEP * actions, -REACH, REACH))
+        gripper = _cable(frame)[:, 0]
+        return project(gripper, np.clip(gripper + STEP * actions, -REACH, REACH))
 
     def observe(self, frame: Frame) -> Array:
         cable = _cable(frame)
@@ -81,15 +82,26 @@ class CableRouting(GoalTask):
         return qpos, np.tile(qvel0, (n, 1))
 
 
-def project(points: Array) -> Array:
-    """Points (N, 2), m, with those inside a logical obstacle moved to the nearest point of its border."""
+def project(start: Array, end: Array) -> Array:
+    """The ends (N, 2), m, of steps, with those inside a logical obstacle moved to the nearest point of its border.
+
+    None goes farther round than 60 degrees as seen from the peg: the gripper moves straight, past a peg and not over it, and
+    from the border of an obstacle that is 1 cm.
+    """
     for peg in PEGS:
-        away = points - peg
-        far = np.linalg.norm(away, axis=1, keepdims=True)
-        # The very middle has no nearest point: any direction will do.
-        outward = np.where(far > 1e-9, away / np.maximum(far, 1e-9), [1.0, 0.0])
-        points = np.where(far < KEEP_OUT, peg + KEEP_OUT * outward, points)
-    return points
+        away, back = end - peg, _unit(start - peg)
+        outward = _unit(away)
+        cosine = (outward * back).sum(axis=1, keepdims=True)
+        farthest = 0.5 * back + np.sqrt(0.75) * _unit(outward - cosine * back)
+        outward = np.where(cosine < 0.5, farthest, outward)
+        end = np.where(np.linalg.norm(away, axis=1, keepdims=True) < KEEP_OUT, peg + KEEP_OUT * outward, end)
+    return end
+
+
+def _unit(vectors: Array) -> Array:
+    """Vectors (N, 2) of length 1; for those of length 0, which point nowhere, any direction will do."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), [1.0, 0.0])
 
 
 def turns(path: Array) -> Array:
