@@ -46,7 +46,7 @@ class CableRouting(GoalTask):
     fields = ("xpos",)
     push_body, camera = "link 6", "fixed"
     horizon = 100
-    disturbance = "severe"
+    disturbance = "extreme"
     offline_pairs = 1381
     expert = "tutelage.envs.experts.cable_routing:CableRouter"
     action_low, action_high = (-np.ones(2, dtype=np.float32), np.ones(2, dtype=np.float32))
