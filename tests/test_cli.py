@@ -244,7 +244,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
     [
         (
             ["run", "Walkr2d"],
-            "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, "
+            "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting, "
             "or your own as module:callable",
         ),
         (["run", "nowhere:make"], "task 'nowhere:make': no module 'nowhere'; install it, or run where Python finds it"),
@@ -296,7 +296,10 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
             "figure 2.3 has the tasks HalfCheetah, Walker2d, Ant; got Humanoid",
         ),
         (["reproduce", "figure-2.3", "--workers", "0"], "workers must be at least 1, got 0"),
-        (["train-expert", "Nope"], "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion"),
+        (
+            ["train-expert", "Nope"],
+            "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting",
+        ),
         (["train-expert", "Walker2d", "--steps", "0"], "steps must be at least 1, got 0"),
         (
             ["train-expert", "Walker2d", "--ppo.rollout", "0"],
@@ -364,7 +367,7 @@ def test_ctrl_c_while_preparing_is_no_traceback(
     def interrupted(*args: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tutelage.experiments.assemble.demonstrations", interrupted)
+    monkeypatch.setattr("tutelage.experiments.prepare.demonstrations", interrupted)
     said = tut("run", "small:point_fleet", *POINTS, "--out", tmp_path / "run")
     assert (said.code, said.err) == (130, "tutelage: interrupted\n")
     assert not (tmp_path / "run" / "config.json").exists()

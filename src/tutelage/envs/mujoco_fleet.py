@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +18,9 @@ from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet, Mask
 from tutelage.seeding import rng_state, set_rng_state
 
+PIXELS = 64
+"""Height and width of the images that a policy sees (section 3.5)."""
+
 
 class MujocoFleet(Fleet):
     """A fleet of MuJoCo robots; see `Fleet` for the contract.
@@ -29,6 +32,9 @@ class MujocoFleet(Fleet):
         success_return: the return an episode must reach, without violation, to be a success (section 5.6: 95 % of
             the expert's). Default: reaching the horizon is enough. A `GoalTask` says itself what success is.
         threads: physics threads; default: all cores of the process.
+        observation: "state", the task's vector; or "images", what the task's camera sees, (N, 64, 64, 3) uint8. Then the
+            vector is in `info["state"]`, (N, D) float64, for humans that are programs. Images are drawn in the thread that
+            calls `reset` and `step_wait`, which must be the same.
     """
 
     def __init__(
@@ -40,6 +46,7 @@ class MujocoFleet(Fleet):
         success_return: float = -math.inf,
         threads: int | None = None,
         render_mode: str | None = None,
+        observation: Literal["state", "images"] = "state",
     ) -> None:
         if isinstance(task, str):
             if task not in TASKS:
@@ -47,6 +54,8 @@ class MujocoFleet(Fleet):
             task = TASKS[task]()
         if num_envs < 1:
             raise ConfigError(f"a fleet needs at least one robot, got {num_envs}")
+        if observation not in ("state", "images"):
+            raise ConfigError(f'observation must be "state" or "images", got {observation!r}')
         self.task = task
         level = task.disturbance if disturbance is None else disturbance
         self.disturbance = parse(level) if isinstance(level, str) else level
@@ -73,6 +82,8 @@ class MujocoFleet(Fleet):
         width = task.observe(self.physics.frame).shape[1]
         self.single_action_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), dtype=np.float64)
+        if observation == "images":
+            self.single_observation_space = gym.spaces.Box(0, 255, (PIXELS, PIXELS, 3), dtype=np.uint8)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
@@ -84,6 +95,7 @@ class MujocoFleet(Fleet):
         self._violation = np.zeros(num_envs, dtype=bool)
         self._complete = np.zeros(num_envs, dtype=bool)
         self._obs = np.zeros((num_envs, width))
+        self._images = np.zeros((num_envs, PIXELS, PIXELS, 3), dtype=np.uint8) if observation == "images" else None
         self._renderers: dict[tuple[int, int], Any] = {}
         self._pending: Any = None
         self._seeded = False
@@ -112,7 +124,8 @@ class MujocoFleet(Fleet):
             self._elapsed[mask], self._return[mask], self._violation[mask], self._complete[mask] = 0, 0.0, False, False
             self._obs = np.where(mask[:, None], self.task.observe(self.physics.frame), self._obs)
             self._position = np.where(mask, self.task.forward(self.physics.frame, self._body_mass), self._position)
-        return self._obs, {"violation": self._violation.copy(), "success": np.zeros(self.num_envs, dtype=bool)}
+            self._look(mask)
+        return self._seen({"violation": self._violation.copy(), "success": np.zeros(self.num_envs, dtype=bool)})
 
     def step_async(self, actions: Array, active: Mask | None = None) -> None:
         actions = np.asarray(actions, dtype=np.float64)
@@ -141,6 +154,7 @@ class MujocoFleet(Fleet):
         position = self.task.forward(frame, self._body_mass)
         reward = np.where(moving & sane, self.task.reward(frame, (position - self._position) / self.dt, actions), 0.0)
         self._obs = np.where((moving & sane)[:, None], obs, self._obs)
+        self._look(moving & sane)
         self._position = np.where(moving & sane, position, self._position)
         self._violation = self._violation | (moving & fell)
         self._elapsed += moving
@@ -157,7 +171,28 @@ class MujocoFleet(Fleet):
             "return": self._return.copy(),
             "elapsed": self._elapsed.copy(),
         }
-        return self._obs, reward, self._violation.copy(), truncated, info
+        seen, info = self._seen(info)
+        return seen, reward, self._violation.copy(), truncated, info
+
+    def _look(self, mask: Mask) -> None:
+        """Draw what the robots of the mask (N,) see, if it is images that are observed."""
+        if self._images is not None:
+            self._images = self._images.copy()  # the old ones belong to whom they were given
+            self._images[mask] = self.images(np.flatnonzero(mask))
+
+    def _seen(self, info: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
+        """What a policy observes of all robots, and the info that goes with it."""
+        if self._images is None:
+            return self._obs, info
+        return self._images, info | {"state": self._obs}
+
+    def images(self, robots: Array | None = None) -> NDArray[np.uint8]:
+        """What the task's camera sees of the given robots (n indices; default: all), (n, 64, 64, 3) uint8."""
+        robots = np.arange(self.num_envs) if robots is None else np.asarray(robots)
+        pictures = np.zeros((len(robots), PIXELS, PIXELS, 3), dtype=np.uint8)
+        for picture, robot in zip(pictures, robots, strict=True):
+            picture[:] = self.render_robot(robot, PIXELS, PIXELS)
+        return pictures
 
     def render(self) -> tuple[Array, ...] | None:
         """A picture of every robot, (H, W, 3) uint8 each, when `render_mode` is "rgb_array"."""
@@ -198,6 +233,7 @@ class MujocoFleet(Fleet):
             "violation": self._violation.copy(),
             "complete": self._complete.copy(),
             "obs": self._obs.copy(),
+            **({} if self._images is None else {"images": self._images.copy()}),
             "push_left": self._pusher.left.copy(),
             "push_wrench": self._pusher.wrench.copy(),
             "rng": rng_state(self._rng),
@@ -214,6 +250,8 @@ class MujocoFleet(Fleet):
         # Folders from before there were goals do not say it: nobody had reached one.
         self._complete = np.array(state.get("complete", np.zeros(self.num_envs, dtype=bool)))
         self._obs = state["obs"].copy()
+        if self._images is not None:
+            self._images = state["images"].copy()
         self._pusher.left[:] = state["push_left"]
         self._pusher.wrench[:] = state["push_wrench"]
         set_rng_state(self._rng, state["rng"])

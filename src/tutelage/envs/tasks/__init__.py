@@ -2,11 +2,14 @@
 
 from tutelage.envs.tasks.ant import Ant
 from tutelage.envs.tasks.base import GoalTask, MujocoTask
+from tutelage.envs.tasks.cable_routing import CableRouting
 from tutelage.envs.tasks.half_cheetah import HalfCheetah
 from tutelage.envs.tasks.humanoid import Humanoid
 from tutelage.envs.tasks.peg_insertion import PegInsertion
 from tutelage.envs.tasks.walker2d import Walker2d
 
-TASKS: dict[str, type[MujocoTask]] = {task.name: task for task in (HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion)}
+TASKS: dict[str, type[MujocoTask]] = {
+    task.name: task for task in (HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting)
+}
 
-__all__ = ["TASKS", "Ant", "GoalTask", "HalfCheetah", "Humanoid", "MujocoTask", "PegInsertion", "Walker2d"]
+__all__ = ["TASKS", "Ant", "CableRouting", "GoalTask", "HalfCheetah", "Humanoid", "MujocoTask", "PegInsertion", "Walker2d"]
