@@ -24,16 +24,30 @@ class StreamingQuantiles:
         self._log_width = math.log1p(2 * accuracy / (1 - accuracy))
         self._lowest = math.floor(math.log(smallest) / self._log_width)
         highest = math.ceil(-math.log(smallest) / self._log_width)
-        self.counts = np.zeros(highest - self._lowest + 2, dtype=np.int64)  # the first bin counts zeros
+        self._counts = np.zeros(highest - self._lowest + 2, dtype=np.int64)  # the first bin counts zeros
+        self._new: list[Array] = []
 
     def __len__(self) -> int:
         return int(self.counts.sum())
 
     def add(self, values: Array) -> None:
         """Take in values (n,) >= 0."""
-        values = np.asarray(values, dtype=np.float64)
+        self._new.append(np.array(values, dtype=np.float64))  # counted together: one value at a time takes as long as a thousand
+        if len(self._new) >= 1000:
+            self._count()
+
+    @property
+    def counts(self) -> Array:
+        """How many values fell into each bin."""
+        self._count()
+        return self._counts
+
+    def _count(self) -> None:
+        if not self._new:
+            return
+        values, self._new = np.concatenate(self._new), []
         bins = np.ceil(np.log(np.clip(values, self.smallest, 1 / self.smallest)) / self._log_width).astype(np.int64)
-        np.add.at(self.counts, np.where(values < self.smallest, 0, bins - self._lowest + 1), 1)
+        np.add.at(self._counts, np.where(values < self.smallest, 0, bins - self._lowest + 1), 1)
 
     def quantile(self, q: float) -> float:
         """The smallest value seen that at least the fraction q of all values does not exceed.
@@ -41,10 +55,11 @@ class StreamingQuantiles:
         Raises:
             ValueError: nothing was added yet.
         """
-        total = len(self)
+        counts = self.counts
+        total = int(counts.sum())
         if not total:
             raise ValueError("a quantile of no values")
-        k = int(np.searchsorted(np.cumsum(self.counts), max(1, math.ceil(q * total))))
+        k = int(np.searchsorted(np.cumsum(counts), max(1, math.ceil(q * total))))
         if k == 0:
             return 0.0
         upper = math.exp((k - 1 + self._lowest) * self._log_width)
@@ -52,10 +67,11 @@ class StreamingQuantiles:
 
     def state_dict(self) -> dict[str, Any]:
         """The counts: only bins that hold something."""
-        (bins,) = np.nonzero(self.counts)
-        return {"bins": bins, "counts": self.counts[bins]}
+        counts = self.counts
+        (bins,) = np.nonzero(counts)
+        return {"bins": bins, "counts": counts[bins]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.counts[:] = 0
-        self.counts[state["bins"]] = state["counts"]
+        self._counts[:], self._new = 0, []
+        self._counts[state["bins"]] = state["counts"]
