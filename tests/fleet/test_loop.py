@@ -667,3 +667,13 @@ def test_a_trembling_hand_resumes_with_the_state_of_the_hand_inside() -> None:
 def test_impossible_humans_are_refused(build, message) -> None:
     with pytest.raises(ConfigError, match=message):
         build()
+
+
+def test_two_humans_for_one_robot_are_refused() -> None:
+    class Crowd(FleetDAgger):
+        def __call__(self, ranks, previous, mode, age, rng):
+            return np.zeros(len(previous), dtype=np.int64)
+
+    loop = make_loop(PointFleet(3), FakePriority(lambda view: [1.0, 0.0, 0.0]), 2, allocator=Crowd(1, 1))
+    with pytest.raises(ContractError, match="two humans to one robot"):
+        loop.step()

@@ -161,6 +161,9 @@ class Loop:
         # A reset that is over, or a fall while teleoperated, ended the intervention: its human is free again.
         ended = ~HELPED[self.mode[np.maximum(before, 0)]]
         self.robot_of = self.allocator(ranks, before, self.mode, self.age, self.rng)
+        helped = self.robot_of[self.robot_of != NOBODY].tolist()
+        if len(set(helped)) < len(helped):
+            raise ContractError("the allocation sends two humans to one robot; eq. 5.1 allows one")
         changed = self.robot_of != before
 
         (left,) = np.nonzero((before != NOBODY) & changed & ~ended)

@@ -32,7 +32,9 @@ class StreamingQuantiles:
 
     def add(self, values: Array) -> None:
         """Take in values (n,) >= 0."""
-        self._new.append(np.array(values, dtype=np.float64))  # counted together: one value at a time takes as long as a thousand
+        self._new.append(
+            np.array(values, dtype=np.float64)
+        )  # counted together: one value at a time takes as long as a thousand
         if len(self._new) >= 1000:
             self._count()
 
