@@ -280,6 +280,9 @@ def figure(results: list[dict[str, Any]]) -> Figure:
                     axis.fill_between(epochs, mean - half, mean + half, color=colour[name], alpha=0.15, linewidth=0)
                 if metric == "supervisor_actions":
                     axis.set_yscale("symlog", linthresh=100)
+                if metric != "return_mean":
+                    axis.set_ylim(bottom=0)  # bands end where counts do
+                    axis.yaxis.set_major_formatter(lambda value, position: f"{value:,.0f}")
                 axis.set_title(f"{task}, {title}", loc="left", color=theme.text, fontsize=9)
                 axis.set_xlabel("epoch", color=theme.muted)
                 axis.grid(color=theme.grid)
