@@ -132,7 +132,7 @@ def test_commands_and_their_options_exist(page: Path) -> None:
 def test_options_in_code_spans_exist(page: Path) -> None:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     own = {"--check", "--write", "--strict", "--seeds", "--ablations"}  # of tables, run_examples, mypy, study
-    known = "".join(filter(None, map(manual, ("run", "evaluate", "report", "train-expert", "check"))))
+    known = "".join(filter(None, map(manual, ("run", "evaluate", "report", "reproduce", "train-expert", "check"))))
     for option in set(re.findall(r"`(--[a-z][\w.-]*)", text)) - own:
         assert option in known, f"no verb has {option}"
 
