@@ -59,7 +59,7 @@ class RunConfig:
             shipped with the task.
         overlap: learn while physics runs (the update at step t then sees the data up to t - 1).
         threads: physics threads; default: all cores, or with overlap all but one.
-        torch_threads: threads of matrix products; default: all cores, at most 4 (more are rarely faster), or with overlap 1.
+        torch_threads: threads of matrix products; default: all cores, at most 4, or with overlap 1.
         out: run folder; default: runs/TASK-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.

@@ -3,8 +3,7 @@
 One robot and one human, epochs of T timesteps, after each a round of training and ten test rollouts without help. Behaviour
 cloning gets as many more offline pairs as LazyDAgger had supervisor actions.
 
-The tasks have their own level of disturbance, and demonstrations are given in calm. The dissertation has none of that; here,
-a policy cloned from 4,000 calm pairs of Walker2d then already reaches the expert's return, and nothing is left to learn.
+The tasks have their own level of disturbance, and demonstrations are given in calm. The dissertation has no disturbances.
 """
 
 from __future__ import annotations
