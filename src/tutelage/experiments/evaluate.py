@@ -47,10 +47,11 @@ def evaluate_policy(
     """
     # The period t_I without hard resets belongs to the beginning of learning.
     thresholds = dataclasses.replace(config.thresholds, initial=0)
-    if thresholds.uncertainty is None and any(isinstance(term, Uncertainty) for term in parse(priority, thresholds).terms):
+    asked = parse(priority, thresholds, config.gate)
+    if thresholds.uncertainty is None and any(isinstance(term, Uncertainty) for term in asked.terms):
         raise ConfigError(f"this run has no threshold of uncertainty, which {priority} needs; choose C. or Random.")
     assembly = assemble(dataclasses.replace(config, priority=priority, thresholds=thresholds))
-    wanted = LEARNED & parse(priority, thresholds).needs
+    wanted = LEARNED & asked.needs
     if wanted and policy is not None:
         try:
             assembly.learner.load_state_dict(learner or {})
@@ -82,7 +83,7 @@ def evaluate_run(
     """
     config = dataclasses.replace(read_config(folder), steps=steps)
     policy = None if expert else EnsemblePolicy.load(folder / "policy.safetensors")[0]
-    learner = learner_state(folder) if LEARNED & parse(priority).needs and not expert else None
+    learner = learner_state(folder) if LEARNED & parse(priority, gate=config.gate).needs and not expert else None
     metrics = evaluate_policy(config, policy, priority, tally, subscribers, learner)
     result = {"steps": steps, "priority": priority, "policy": "expert" if expert else "run", **metrics}
     write_atomic(evaluation_path(folder, expert), json.dumps(result, indent=2).encode())

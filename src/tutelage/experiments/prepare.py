@@ -41,7 +41,7 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
     learner.dataset.add(obs[~held_out], actions[~held_out])
     _in_steps(c.learner.pretrain, learner.gradient_steps, "behaviour cloning", report)
 
-    needs = parse(c.priority).needs
+    needs = parse(c.priority, gate=c.gate).needs
     offline = discrepancy(policy.act(obs), actions, assembly.fleet.action_low, assembly.fleet.action_high)
     if c.gate.beta_h is None:
         c = dataclasses.replace(c, gate=dataclasses.replace(c.gate, beta_h=float(np.quantile(offline, 1 - c.gate.unsafe))))
