@@ -247,8 +247,7 @@ class MujocoFleet(Fleet):
         self._return[:] = state["return"]
         self._position = state["position"].copy()
         self._violation = state["violation"].copy()
-        # Folders from before there were goals do not say it: nobody had reached one.
-        self._complete = np.array(state.get("complete", np.zeros(self.num_envs, dtype=bool)))
+        self._complete = state["complete"].copy()
         self._obs = state["obs"].copy()
         if self._images is not None:
             self._images = state["images"].copy()
