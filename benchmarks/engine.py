@@ -14,7 +14,7 @@ from gymnasium.vector import SyncVectorEnv
 from benchmarks.timing import table, take_turns
 from tutelage.envs.engine import wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
-from tutelage.envs.tasks import TASKS
+from tutelage.envs.tasks import MUJOCO
 from tutelage.envs.tasks.base import GYMNASIUM
 
 STEPS, THREADS = {1: 50, 100: 20, 1000: 5}, (1, 2, 4)
@@ -30,7 +30,7 @@ def run(quick: bool = False) -> dict[str, Any]:
     results = []
     for robots in STEPS:
         rows = []
-        for task in (name for name, own in TASKS.items() if own.assets == GYMNASIUM):  # what others can run too
+        for task in (name for name, own in MUJOCO.items() if own.assets == GYMNASIUM):  # what others can run too
             rates = measure(task, robots, rounds=3 if quick else 5)
             rows.append([task, *rates.values()])
             results.append({"task": task, "robots": robots, "steps a second": rates})

@@ -29,7 +29,7 @@ from tutelage.policies.expert import GaussianActor
 pytest.importorskip("mujoco")
 pytest.importorskip("pyarrow")
 
-VERBS = ("run", "resume", "evaluate", "report", "reproduce", "train-expert", "check", "info")
+VERBS = ("run", "resume", "evaluate", "report", "reproduce", "train-expert", "watch", "check", "info")
 POINTS = [*FLAGS[FLAGS.index("--steps") :], "--robots", "6", "--humans", "2", "--expert", "small:Homing"]
 POINTS[POINTS.index("--threads") : POINTS.index("--threads") + 2] = []
 POINTS[POINTS.index("--offline-pairs") + 1] = "100"
@@ -218,7 +218,7 @@ def refused(said: Said) -> str:
         (["run", "Walker2d", "--bogus", "3"], "Unrecognized options: --bogus"),
         (["run", "Walker2d", "--robot", "3"], "--robots"),
         (["rnu", "Walker2d"], "rnu"),
-        ([], "{run, resume, evaluate, report, reproduce, train-expert, check, info}"),
+        ([], "{run, resume, evaluate, report, reproduce, train-expert, watch, check, info}"),
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
@@ -244,8 +244,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
     [
         (
             ["run", "Walkr2d"],
-            "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting, "
-            "or your own as module:callable",
+            f"unknown task 'Walkr2d' (did you mean Walker2d?); tasks: {', '.join(TASKS)}, or your own as module:callable",
         ),
         (["run", "nowhere:make"], "task 'nowhere:make': no module 'nowhere'; install it, or run where Python finds it"),
         (
@@ -296,10 +295,13 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
             "figure 2.3 has the tasks HalfCheetah, Walker2d, Ant; got Humanoid",
         ),
         (["reproduce", "figure-2.3", "--workers", "0"], "workers must be at least 1, got 0"),
+        (["train-expert", "Nope"], f"unknown task 'Nope'; known tasks: {', '.join(TASKS)}"),
         (
-            ["train-expert", "Nope"],
-            "unknown task 'Nope'; known tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting",
+            ["train-expert", "Navigation"],
+            "the expert of Navigation is a program, tutelage.envs.experts.navigation:team: nothing to train",
         ),
+        (["watch", "Navigation", "--out", "x.jpg"], "cannot write x.jpg: a film is .gif or .mp4, a sheet .png"),
+        (["watch", "Navigation", "--robots", "0"], "robots must be at least 1, got 0"),
         (["train-expert", "Walker2d", "--steps", "0"], "steps must be at least 1, got 0"),
         (
             ["train-expert", "Walker2d", "--ppo.rollout", "0"],

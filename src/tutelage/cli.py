@@ -22,6 +22,7 @@ from tyro.conf import Positional, arg
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import ExpertConfig, RunConfig
+from tutelage.experiments.watch import WatchConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -149,6 +150,15 @@ def train_expert(config: Annotated[ExpertConfig, arg(name="")]) -> None:
     train(config, lambda line: console.print(line, highlight=False, soft_wrap=True))
 
 
+def watch(config: Annotated[WatchConfig, arg(name="")]) -> None:
+    """A fleet at work, driven by its algorithmic humans or by a learned policy: a film (GIF, MP4) or a sheet (PNG)."""
+    from tutelage.experiments import watch as film
+
+    with console.status(f"drawing {config.path}"):
+        path = film.watch(config)
+    console.print(f"written: {path}", highlight=False, soft_wrap=True)
+
+
 def check(
     kind: Positional[Literal["env", "policy", "priority", "supervisor"]],
     name: Positional[str],
@@ -205,12 +215,12 @@ def info(what: Positional[Literal["tasks", "levels", "priorities", "version"]] =
         rows += [[name, (gate.__doc__ or "").splitlines()[0]] for name, gate in GATES.items()]
         _print_table(["term", "meaning"], rows)
     else:
-        from tutelage.envs.mujoco_fleet import MujocoFleet
+        from tutelage.envs.registry import make_fleet
         from tutelage.envs.tasks import TASKS
 
         rows = []
         for name, task in TASKS.items():
-            fleet = MujocoFleet(name, 1, threads=1)
+            fleet = make_fleet(name, 1, threads=1)
             sizes = [str(fleet.single_observation_space.shape[0]), str(len(fleet.action_low)), str(task.horizon)]  # type: ignore[index]
             rows.append([name, *sizes, task.disturbance, *_supervisor(name, task.disturbance), task.summary])
             fleet.close()
@@ -296,6 +306,7 @@ def main(args: Sequence[str] | None = None) -> None:
         "report": report,
         "reproduce": reproduce,
         "train-expert": train_expert,
+        "watch": watch,
         "check": check,
         "info": info,
     }

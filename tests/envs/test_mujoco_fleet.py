@@ -13,7 +13,7 @@ import pytest
 from tutelage.checks import check_env
 from tutelage.envs.engine import BAD_VELOCITY, wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
-from tutelage.envs.tasks import TASKS, Walker2d
+from tutelage.envs.tasks import MUJOCO, Walker2d
 from tutelage.errors import ConfigError, ContractError
 from tutelage.store import load_tree, save_tree
 
@@ -53,7 +53,7 @@ def topple(fleet: MujocoFleet, robot: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("level", ["none", "severe"])
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", MUJOCO)
 @pytest.mark.filterwarnings("ignore:check_env")
 def test_fleets_keep_the_contract(name: str, level: str) -> None:
     fleet = MujocoFleet(name, 5, disturbance=level, threads=2)
@@ -61,7 +61,7 @@ def test_fleets_keep_the_contract(name: str, level: str) -> None:
     fleet.close()
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", MUJOCO)
 def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     runs = []
     for threads in (1, 3):
@@ -72,7 +72,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     assert alike(*runs)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", MUJOCO)
 def test_a_saved_fleet_continues_bit_for_bit_in_a_new_one(name: str, tmp_path: Path) -> None:
     fleet, other = (MujocoFleet(name, 6, disturbance="severe", threads=1) for _ in range(2))
     fleet.reset(seed=7)
@@ -229,7 +229,7 @@ def test_unstable_physics_is_a_violation_of_that_robot_alone(name: str, field: s
     calm.close()
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", MUJOCO)
 def test_physics_that_diverges_within_a_timestep_is_noticed_there(name: str) -> None:
     fleet = MujocoFleet(name, 3, disturbance="none", threads=1)
     fleet.reset(seed=0)

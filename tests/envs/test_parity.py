@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from tutelage.envs.mujoco_fleet import MujocoFleet
-from tutelage.envs.tasks import TASKS
+from tutelage.envs.tasks import MUJOCO
 from tutelage.envs.tasks.base import GYMNASIUM
 
-THEIRS = [name for name, task in TASKS.items() if task.assets == GYMNASIUM]
+THEIRS = [name for name, task in MUJOCO.items() if task.assets == GYMNASIUM]
 ROBOTS, STEPS, TOLERANCE = 3, 120, 1e-9
 
 

@@ -9,8 +9,8 @@ import pytest
 from fakes import PointFleet
 
 from tutelage.envs import registry
-from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import make_fleet, task_names
+from tutelage.envs.task_fleet import TaskFleet
 from tutelage.envs.tasks import TASKS, Walker2d
 from tutelage.errors import ConfigError, ContractError
 
@@ -32,7 +32,7 @@ def nothing(num_envs: int) -> None:
 @pytest.mark.parametrize("name", TASKS)
 def test_built_in_tasks(name: str) -> None:
     fleet = make_fleet(name, 3, disturbance="mild", threads=1, success_return=10.0)
-    assert isinstance(fleet, MujocoFleet)
+    assert isinstance(fleet, TaskFleet)
     assert (fleet.task.name, fleet.num_envs, fleet.disturbance.noise, fleet.success_return) == (name, 3, 0.1, 10.0)
     fleet.close()
 

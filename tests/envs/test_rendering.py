@@ -12,7 +12,7 @@ import pytest
 from tutelage.envs import rendering
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.rendering import Renderer, gl_backend
-from tutelage.envs.tasks import TASKS
+from tutelage.envs.tasks import MUJOCO
 from tutelage.errors import ConfigError, TutelageError
 
 
@@ -43,7 +43,7 @@ def robot_pixels(picture: Any) -> Any:
 
 @pytest.mark.render
 @pytest.mark.parametrize("size", [(320, 240), (100, 100), (90, 160)])
-@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.camera is None])
+@pytest.mark.parametrize("name", [name for name, task in MUJOCO.items() if task.camera is None])
 def test_the_robot_is_in_the_picture_wherever_it_went(fleet_of: Any, name: str, size: tuple[int, int]) -> None:
     fleet = fleet_of(name)
     width, height = size

@@ -24,6 +24,7 @@ class Disturbance:
         push_interval: mean time between the starts of two pushes of a robot, seconds (memoryless).
         mass: each robot's masses are scaled by one number in [1 - mass, 1 + mass], drawn at each seeded reset.
         friction: likewise for sliding friction.
+        wind: how far the wind carries a robot in a timestep where the task has a windy place, in the task's unit of length.
     """
 
     noise: float = 0.0
@@ -32,6 +33,7 @@ class Disturbance:
     push_interval: float = 2.0
     mass: float = 0.0
     friction: float = 0.0
+    wind: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():

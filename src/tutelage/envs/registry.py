@@ -11,7 +11,7 @@ from typing import Any
 
 from tutelage.envs.disturbance import Disturbance
 from tutelage.envs.tasks import TASKS
-from tutelage.envs.tasks.base import MujocoTask
+from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet
 
@@ -36,10 +36,10 @@ def make_fleet(
 
     Args:
         task: a built-in task ("Walker2d"), the name of an entry point of the group "tutelage.tasks", or
-            "module:callable". The callable is a subclass of `MujocoTask`, or is called as
+            "module:callable". The callable is a subclass of `Task`, or is called as
             `callable(num_envs, **kwargs)` and returns a `Fleet`.
         num_envs: N robots.
-        disturbance: for the MuJoCo tasks, see `MujocoFleet`. Handed to a callable only when given, like `threads`.
+        disturbance: for the built-in tasks, see `TaskFleet`. Handed to a callable only when given, like `threads`.
         threads: physics threads.
         kwargs: further arguments of the fleet, such as `success_return`.
 
@@ -50,11 +50,10 @@ def make_fleet(
     given = {"disturbance": disturbance, "threads": threads}
     settings = {name: value for name, value in given.items() if value is not None} | kwargs
     make: Any = find_task(task)
-    if isinstance(make, type) and issubclass(make, MujocoTask):
-        from tutelage.envs.mujoco_fleet import MujocoFleet
-
-        _fits(MujocoFleet, task, make, num_envs, settings=settings)
-        return MujocoFleet(make(), num_envs, **settings)
+    if isinstance(make, type) and issubclass(make, Task):
+        kind = make.fleet_type()
+        _fits(kind, task, make, num_envs, settings=settings)
+        return kind(make(), num_envs, **settings)
     _fits(make, task, num_envs, settings=settings)
     fleet = make(num_envs, **settings)
     if not isinstance(fleet, Fleet):

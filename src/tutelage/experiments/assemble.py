@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from tutelage.cores import available_cores, default_torch_threads
 from tutelage.envs import experts
-from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import find_task, make_fleet
+from tutelage.envs.task_fleet import TaskFleet
 from tutelage.envs.tasks import TASKS
-from tutelage.envs.tasks.base import MujocoTask
+from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.allocation import FleetDAgger
@@ -28,13 +28,14 @@ from tutelage.fleet.loop import Loop
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import Lexicographic, parse
 from tutelage.fleet.supervisor import NoisySupervisor, PolicySupervisor, Supervisor, Team
-from tutelage.fleet.view import Signal
+from tutelage.fleet.view import FleetView, Signal
 from tutelage.learning.classifier import DiscrepancyClassifier
 from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.imitation import ImitationLearner
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.policies.expert import GaussianActor
+from tutelage.policies.kinds import kinds_of
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
@@ -59,11 +60,9 @@ class Assembly:
         priority = parse(c.priority, c.thresholds, c.gate)
         if "goal" in priority.needs and not self.fleet.goal_conditioned:
             raise ConfigError(f"{c.priority} needs a task with a goal, and {c.task} has none; use C.U.R. or U.C.")
-        supervisor: Supervisor = PolicySupervisor(self.actor)
-        if c.supervisor_noise:
-            sigma = c.supervisor_noise * float((self.fleet.action_high - self.fleet.action_low).mean() / 2)
-            supervisor = NoisySupervisor(supervisor, sigma, stream(c.seed, "supervisor noise"))
-        team, omega = Team([supervisor] * c.humans, c.latency), FleetDAgger(c.t_teleop, c.t_reset)
+        kinds = self._supervisors()
+        team = Team([kinds[j % len(kinds)] for j in range(c.humans)], c.latency)
+        omega = FleetDAgger(c.t_teleop, c.t_reset)
         signals = self._signals()
         if frozen is not None:
             return Loop(self.fleet, frozen, priority, team, omega, signals=signals, seed=derive(c.seed, "evaluation"))
@@ -72,11 +71,25 @@ class Assembly:
             execution=self._execution(priority), overlap=c.overlap, seed=c.seed,
         )  # fmt: skip
 
+    def _supervisors(self) -> list[Supervisor]:
+        """One human of each kind."""
+        c = self.config
+        supervisors: list[Supervisor] = [PolicySupervisor(kind) for kind in kinds_of(self.actor)]
+        if c.supervisor_noise:
+            sigma = c.supervisor_noise * float((self.fleet.action_high - self.fleet.action_low).mean() / 2)
+            names = ["supervisor noise", *(f"supervisor noise/{k}" for k in range(1, len(supervisors)))]
+            return [NoisySupervisor(s, sigma, stream(c.seed, name)) for s, name in zip(supervisors, names, strict=True)]
+        return supervisors
+
+    def _judgement(self, view: FleetView) -> Array:
+        """How much what the policy proposes differs from what a human would do; of any kind, for all of them do it well."""
+        low, high = self.fleet.action_low, self.fleet.action_high
+        return np.min([discrepancy(view.actions, kind.act(view.obs), low, high) for kind in kinds_of(self.actor)], axis=0)  # type: ignore[no-any-return]
+
     def _signals(self) -> dict[str, Signal]:
         """What the critics, the classifier and the humans' own judgement say."""
-        low, high = self.fleet.action_low, self.fleet.action_high
         signals = {name: _estimate(critic) for name, critic in self.learner.critics.items()}
-        signals["judgement"] = lambda view: discrepancy(view.actions, self.actor.act(view.obs), low, high)
+        signals["judgement"] = self._judgement
         if classifier := self.learner.classifier:
             signals["predicted_discrepancy"] = lambda view: classifier(view.obs)
         return signals
@@ -110,7 +123,7 @@ def assemble(config: RunConfig) -> Assembly:
             f"the expert {config.expert} sees {actor.features} numbers and gives {len(actor.low)} actions, "
             f"but {config.task} shows {width} and takes {actions}; train one with: tutelage train-expert {config.task}"
         )
-    if isinstance(fleet, MujocoFleet) and not fleet.goal_conditioned:
+    if isinstance(fleet, TaskFleet) and not fleet.goal_conditioned:
         if config.success_return is None and config.task in TASKS:  # once: a level that is not on the card is measured
             config = dataclasses.replace(config, success_return=_success_return(config, actor))
         if config.success_return is not None:
@@ -141,11 +154,11 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
     changes: dict[str, Any] = {}
     t = config.thresholds
     found = find_task(config.task)
-    task = found if isinstance(found, type) and issubclass(found, MujocoTask) else None
+    task = found if isinstance(found, type) and issubclass(found, Task) else None
     if config.disturbance is None and task:
         changes["disturbance"] = task.disturbance
     if config.offline_pairs is None:
-        changes["offline_pairs"] = (task or MujocoTask).offline_pairs
+        changes["offline_pairs"] = (task or Task).offline_pairs
     if t.initial is None:
         initial = task.initial_period if task and config.priority.strip(".") == "C.U.R" else 0
         changes["thresholds"] = dataclasses.replace(t, initial=initial)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.envs.registry import make_fleet
-from tutelage.envs.tasks.base import MujocoTask
+from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError
 from tutelage.experiments.assemble import Assembly
 from tutelage.experiments.config import RunConfig
@@ -19,6 +19,7 @@ from tutelage.fleet.discrepancy import discrepancy
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import parse
+from tutelage.policies.kinds import kinds_of
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
@@ -68,10 +69,11 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
     Where there is a goal an episode ends with it, those that do not reach it are left out too, and robots demonstrate again
     until there are pairs enough.
     """
-    wanted = config.offline_pairs or MujocoTask.offline_pairs
+    wanted = config.offline_pairs or Task.offline_pairs
     episodes = max(1, round(wanted / horizon))
     length = min(horizon, -(-wanted // episodes))
     spare = episodes + 2 + episodes // 4  # the human repeats a demonstration that failed
+    spare += -spare % len(kinds_of(actor))  # as many of one kind of human as of the other
     # A fleet of the user's own need not know levels; a run on one that does has a level by now.
     level = None if config.disturbance is None else config.offline_disturbance
     fleet = make_fleet(config.task, spare, disturbance=level, threads=config.threads)

@@ -13,6 +13,7 @@ import torch
 from tutelage.cores import default_torch_threads
 from tutelage.envs import experts
 from tutelage.envs.mujoco_fleet import MujocoFleet
+from tutelage.envs.tasks import TASKS
 from tutelage.errors import ConfigError
 from tutelage.experiments.config import ExpertConfig
 from tutelage.learning.ppo import PPO
@@ -24,10 +25,10 @@ def train(config: ExpertConfig, say: Callable[[str], None] = print) -> Path:
     """Train, score and save a controller; returns the path of its weights."""
     torch.set_num_threads(config.torch_threads or default_torch_threads())
     out = config.out or Path("runs") / f"expert-{config.task}"
+    program = TASKS[config.task].expert if config.task in TASKS else None
+    if program:
+        raise ConfigError(f"the expert of {config.task} is a program, {program}: nothing to train")
     fleet = MujocoFleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)
-    if fleet.task.expert:
-        fleet.close()
-        raise ConfigError(f"the expert of {config.task} is a program, {fleet.task.expert}: nothing to train")
     level = config.disturbance or fleet.task.disturbance
     ppo = PPO(fleet, fleet.task.expert_features or fleet.single_observation_space.shape[0], config.ppo, config.seed)  # type: ignore[index]
     checkpoint, best_path, best = out / "ppo.safetensors", out / "best.safetensors", float("-inf")

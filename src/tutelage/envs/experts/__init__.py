@@ -1,6 +1,6 @@
 """The shipped controllers that act as algorithmic supervisors, and what each scored.
 
-A controller is a file of trained weights, or a program that the task names (`MujocoTask.expert`). One with weights is called
+A controller is a file of trained weights, or a program that the task names (`Task.expert`). One with weights is called
 an expert only if its mean return reaches the published expert's (see `PUBLISHED`). The scores of a program are measured by
 
     python -m tutelage.envs.experts.score PegInsertion
@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.registry import find_task, load_object, make_fleet
 from tutelage.envs.rollout import rollout
-from tutelage.envs.tasks.base import MujocoTask
+from tutelage.envs.task_fleet import TaskFleet
+from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.policy import Policy
 from tutelage.policies.expert import GaussianActor
@@ -65,7 +65,7 @@ def program_of(task: str) -> str | None:
         ConfigError: an unknown task.
     """
     found = find_task(task)
-    return found.expert if isinstance(found, type) and issubclass(found, MujocoTask) else None
+    return found.expert if isinstance(found, type) and issubclass(found, Task) else None
 
 
 def load(task: str, path: Path | None = None) -> tuple[Policy, dict[str, Any]]:
@@ -112,7 +112,7 @@ def evaluate(
 ) -> Score:
     """Run a controller for one episode on each of `episodes` robots. The seed is one that no training uses."""
     fleet = make_fleet(task, episodes, disturbance=level, threads=threads)
-    if not isinstance(fleet, MujocoFleet):
+    if not isinstance(fleet, TaskFleet):
         raise ConfigError(f"{task} has no levels of disturbance to score an expert at")
     episodes_of = rollout(fleet, actor, derive(seed, f"evaluate expert/{level}") % 2**32)
     fleet.close()

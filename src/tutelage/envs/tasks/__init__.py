@@ -1,15 +1,21 @@
-"""The tasks of the batched MuJoCo engine."""
+"""The built-in tasks."""
 
 from tutelage.envs.tasks.ant import Ant
-from tutelage.envs.tasks.base import GoalTask, MujocoTask
+from tutelage.envs.tasks.base import ArrayTask, GoalTask, MujocoTask, Task
 from tutelage.envs.tasks.cable_routing import CableRouting
 from tutelage.envs.tasks.half_cheetah import HalfCheetah
 from tutelage.envs.tasks.humanoid import Humanoid
+from tutelage.envs.tasks.navigation import Navigation
 from tutelage.envs.tasks.peg_insertion import PegInsertion
 from tutelage.envs.tasks.walker2d import Walker2d
 
-TASKS: dict[str, type[MujocoTask]] = {
-    task.name: task for task in (HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting)
+TASKS: dict[str, type[Task]] = {
+    task.name: task for task in (HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting, Navigation)
 }
+MUJOCO: dict[str, type[MujocoTask]] = {name: task for name, task in TASKS.items() if issubclass(task, MujocoTask)}
+"""Those that run on the batched MuJoCo engine."""
 
-__all__ = ["TASKS", "Ant", "CableRouting", "GoalTask", "HalfCheetah", "Humanoid", "MujocoTask", "PegInsertion", "Walker2d"]
+__all__ = [
+    "MUJOCO", "TASKS", "Ant", "ArrayTask", "CableRouting", "GoalTask", "HalfCheetah", "Humanoid", "MujocoTask", "Navigation",
+    "PegInsertion", "Task", "Walker2d",
+]  # fmt: skip

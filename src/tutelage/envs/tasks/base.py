@@ -1,14 +1,18 @@
-"""What a MuJoCo task declares; the engine does the rest."""
+"""What a task declares; its fleet does the rest."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from tutelage.envs.task_fleet import TaskFleet
 
 Array = NDArray[Any]
 Frame = dict[str, Array]
@@ -17,13 +21,102 @@ GYMNASIUM = Path(str(files("gymnasium"))) / "envs" / "mujoco" / "assets"
 """The MJCF files that Gymnasium ships."""
 
 
-class MujocoTask(ABC):
+class Task(ABC):
+    """One task, vectorised over robots, whatever simulates it."""
+
+    name: ClassVar[str]
+    horizon: ClassVar[int] = 1000
+    goal: ClassVar[bool] = False
+    """Whether success means reaching a goal state; else it is an episode without violation and with the return asked for."""
+    disturbance: ClassVar[str] = "none"
+    """The level at which the task is benchmarked (fixed by the rule in docs/tasks.md)."""
+    offline_pairs: ClassVar[int] = 5000
+    """State-action pairs of the human before a run (fixed by the same rule)."""
+    initial_period: ClassVar[int] = 250
+    """t_I of C.U.R., timesteps (table C.1)."""
+    expert: ClassVar[str | None] = None
+    """The algorithmic human, where it is a program: "module:callable" of a policy. None: trained weights."""
+    expert_features: ClassVar[int | None] = None
+    """The expert sees only the first so many numbers of an observation; None: all."""
+    action_low: ClassVar[Array | None] = None
+    action_high: ClassVar[Array | None] = None
+    """(A,) bounds of the actions; None, for a MuJoCo task: those of the actuators. Set them together with `control`."""
+    summary: ClassVar[str]
+
+    @staticmethod
+    @abstractmethod
+    def fleet_type() -> type[TaskFleet]:
+        """The fleet that runs such tasks. Imported here, so that what one simulator needs is no burden on the others."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What the level of disturbance does to the robots of an `ArrayTask` in a timestep.
+
+    Attributes:
+        noise: (N, `noise_size`) standard normal numbers, times the level's noise.
+        friction: (N,) what to scale friction by.
+        wind: the level's.
+    """
+
+    noise: Array
+    friction: Array
+    wind: float
+
+
+class ArrayTask(Task):
+    """A task with a goal whose physics is written as array operations. Stateless: everything is in the state (N, S) float64.
+
+    Of a level of disturbance it knows what is in `World`; pushes and masses mean nothing to it.
+    """
+
+    goal = True
+    dt: ClassVar[float]
+    """Seconds of a timestep."""
+    noise_size: ClassVar[int]
+    """How many random numbers a robot's timestep needs."""
+
+    @staticmethod
+    def fleet_type() -> type[TaskFleet]:
+        from tutelage.envs.array_fleet import ArrayFleet
+
+        return ArrayFleet
+
+    @abstractmethod
+    def initial(self, rng: np.random.Generator, n: int) -> Array:
+        """Draw n initial states, (n, S)."""
+
+    def onward(self, rng: np.random.Generator, state: Array) -> Array:
+        """Initial states for robots that completed the task in the states (n, S): by default any others."""
+        return self.initial(rng, len(state))
+
+    @abstractmethod
+    def advance(self, state: Array, actions: Array, world: World) -> Array:
+        """The states (N, S) one timestep after the states (N, S), for actions (N, A). A new array."""
+
+    @abstractmethod
+    def observe(self, state: Array) -> Array:
+        """(N, D) float64."""
+
+    @abstractmethod
+    def violation(self, state: Array) -> NDArray[np.bool_]:
+        """The constraint c(s), (N,)."""
+
+    @abstractmethod
+    def success(self, state: Array) -> NDArray[np.bool_]:
+        """Whether each robot is in the goal set, (N,)."""
+
+    @abstractmethod
+    def draw(self, state: Array, width: int, height: int) -> NDArray[np.uint8]:
+        """What the robots in the states (n, S) look like from above, (n, height, width, 3)."""
+
+
+class MujocoTask(Task):
     """One task on the batched engine, vectorised over robots. Stateless: everything is in the frame.
 
     A frame maps the name of each `mjData` field in `fields` to its values for all robots, (N, *field shape).
     """
 
-    name: ClassVar[str]
     xml: ClassVar[str]
     assets: ClassVar[Path] = GYMNASIUM
     """The folder of `xml`."""
@@ -35,22 +128,12 @@ class MujocoTask(ABC):
     """What pushes act on; a body weight is the weight of all that hangs together with it."""
     camera: ClassVar[str | None] = None
     """Name of a camera of the model for pictures; None: one that follows `push_body`."""
-    horizon: ClassVar[int] = 1000
-    disturbance: ClassVar[str] = "none"
-    """The level at which the task is benchmarked (fixed by the rule in docs/tasks.md)."""
-    offline_pairs: ClassVar[int] = 5000
-    """State-action pairs of the human before a run (fixed by the same rule)."""
-    initial_period: ClassVar[int] = 250
-    """t_I of C.U.R., timesteps (table C.1)."""
-    expert: ClassVar[str | None] = None
-    """The algorithmic human, where it is a program: "module:callable" of a policy. None: trained weights."""
-    expert_features: ClassVar[int | None] = None
-    """The expert sees only the first so many numbers of an observation; None: all."""
-    symmetry: ClassVar[tuple[Array, Array] | None] = None
-    action_low: ClassVar[Array | None] = None
-    action_high: ClassVar[Array | None] = None
-    """(A,) bounds of the actions; None: those of the actuators. Set them together with `control`."""
-    summary: ClassVar[str]
+
+    @staticmethod
+    def fleet_type() -> type[TaskFleet]:
+        from tutelage.envs.mujoco_fleet import MujocoFleet
+
+        return MujocoFleet
 
     @property
     def xml_path(self) -> Path:
@@ -87,6 +170,8 @@ class MujocoTask(ABC):
 
 class GoalTask(MujocoTask):
     """A task that is complete as soon as the robot reaches a goal state, where its episode ends."""
+
+    goal = True
 
     @abstractmethod
     def success(self, frame: Frame) -> NDArray[np.bool_]:
