@@ -265,7 +265,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (
             ["run", "Walker2d", "--disturbance", "awful"],
             "unknown disturbance 'awful'; use one of none, mild, light, moderate, strong, severe, extreme, or name=value "
-            "with names noise, push, push_seconds, push_interval, mass, friction",
+            "with names noise, push, push_seconds, push_interval, mass, friction, wind",
         ),
         (["run", "Walker2d", "--disturbance", "push=nan"], "disturbance push must be a number >= 0, got nan"),
         (["run", "Walker2d", "--hidden", "0"], "hidden layers must be at least 1 wide, got (0,)"),
