@@ -118,7 +118,7 @@ def test_wind_is_strong_but_can_be_held_against() -> None:
 def test_the_task_has_wind_and_its_demonstrations_do_not() -> None:
     assert ArrayFleet("Navigation", 1).disturbance.wind == 0.75
     config = assemble(RunConfig("Navigation", robots=4, humans=2, threads=1, offline_pairs=300)).config
-    obs, _ = demonstrations(config, team(), 200)
+    obs = demonstrations(config, team(), 200)[0]
     assert (obs[obs[:, 0] >= WINDY[0]][:, 1] == MIDDLE).all()
 
 
@@ -144,7 +144,7 @@ def test_a_human_gets_to_the_goal_from_every_cell(human: Navigator) -> None:
     cells = np.argwhere(~WALLS)
     fleet = at(*cells, level="wind=0.75")
     fleet.horizon = 400
-    obs, succeeded = fleet.state, np.zeros(len(cells), dtype=bool)
+    obs, succeeded = fleet.states, np.zeros(len(cells), dtype=bool)
     for _ in range(300):
         obs, _, _, _, info = fleet.step(human.act(obs))
         succeeded |= info["success"]
@@ -159,7 +159,7 @@ def test_beside_the_obstacle_a_human_goes_on_the_way_that_was_taken() -> None:
 
 def test_humans_of_both_kinds_demonstrate_equally_often_and_teleoperate_in_turn() -> None:
     config = RunConfig("Navigation", robots=6, humans=5, threads=1, offline_pairs=2220)
-    obs, _ = demonstrations(config, team(), 200)
+    obs = demonstrations(config, team(), 200)[0]
     beside = (obs[:, 0] > 30) & (obs[:, 0] < 45)
     assert abs((obs[beside][:, 1] > MIDDLE).mean() - 0.5) < 0.01
     people = assemble(config).loop().team

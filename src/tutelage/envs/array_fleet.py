@@ -55,7 +55,7 @@ class ArrayFleet(TaskFleet):
         self._declare(self.task.action_low, self.task.action_high, self._observe().shape[1])
 
     @property
-    def state(self) -> Array:
+    def states(self) -> Array:
         """The robots' states (N, S): what their task says. Not to be changed."""
         return self._state
 

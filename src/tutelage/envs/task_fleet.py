@@ -107,6 +107,11 @@ class TaskFleet(Fleet):
         self.metadata = {**self.metadata, "render_modes": ["rgb_array"], "render_fps": max(1, round(1 / self.dt))}
         self._obs = np.zeros((self.num_envs, width))
 
+    @property
+    def state(self) -> Array | None:
+        """The task's vectors, (N, D) float64, where images are observed."""
+        return None if self._images is None else self._obs
+
     # -- what simulates the robots ------------------------------------------------------------------------------
 
     @abstractmethod

@@ -50,7 +50,7 @@ class CableRouting(GoalTask):
     offline_pairs = 1381
     expert = "tutelage.envs.experts.cable_routing:CableRouter"
     action_low, action_high = (-np.ones(2, dtype=np.float32), np.ones(2, dtype=np.float32))
-    summary = "a gripper draws a cable around four pegs into a figure 8; violation: its free end was drawn in"
+    summary = "a cable is drawn around four pegs into a figure 8; violation: its free end was drawn in"
 
     def control(self, frame: Frame, actions: Array) -> Array:
         # From where the gripper is, not from where it was told to be: what pulls at a taut cable does not wind up.
