@@ -187,7 +187,7 @@ def _expert(config: RunConfig) -> Policy:
 def _success_return(config: RunConfig, actor: Policy) -> float:
     """What makes an episode a success: 95 % of the shipped expert's return, or of this run's where none is shipped."""
     assert config.disturbance is not None
-    if experts.path_of(config.task).exists():
+    if experts.path_of(config.task).exists() or experts.program_of(config.task):
         return experts.success_return(config.task, config.disturbance, threads=config.threads)
     if isinstance(actor, GaussianActor):
         return experts.success_return(config.task, config.disturbance, Path(config.expert or ""), threads=config.threads)

@@ -1,6 +1,7 @@
 """The built-in tasks."""
 
 from tutelage.envs.tasks.ant import Ant
+from tutelage.envs.tasks.ball_balance import BallBalance
 from tutelage.envs.tasks.base import ArrayTask, GoalTask, MujocoTask, Task
 from tutelage.envs.tasks.block_pushing import BlockPushing, ObstaclePushing
 from tutelage.envs.tasks.cable_routing import CableRouting
@@ -22,6 +23,7 @@ TASKS: dict[str, type[Task]] = {
         Navigation,
         BlockPushing,
         ObstaclePushing,
+        BallBalance,
     )
 }
 MUJOCO: dict[str, type[MujocoTask]] = {name: task for name, task in TASKS.items() if issubclass(task, MujocoTask)}
