@@ -20,6 +20,7 @@ from tutelage.experiments.jobs import Job, run_jobs, slug
 from tutelage.experiments.plots import interval
 from tutelage.experiments.study import one
 from tutelage.fleet.gates import GATES, GateConfig
+from tutelage.learning.imitation import LearnerConfig
 
 THRIFTY_ALONE = "ThriftyDAgger (-Risk)"
 
@@ -59,7 +60,7 @@ def configurations(config: GatesConfig) -> dict[str, RunConfig]:
         config.task, "C.", robots=config.robots, humans=config.humans, steps=config.steps, threads=1, torch_threads=1,
         record="none", label="Behaviour cloning (C.)",
     )  # fmt: skip
-    runs = {base.algorithm: base}
+    runs = {base.algorithm: dataclasses.replace(base, learner=LearnerConfig(schedule="never"))}
     for name in GATES:
         label = THRIFTY_ALONE if name == "ThriftyDAgger" else name
         gate = GateConfig(without="risk") if name == "ThriftyDAgger" else GateConfig()
