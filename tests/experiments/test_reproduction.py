@@ -55,7 +55,7 @@ def test_figure_2_3_from_runs_to_table_and_picture(tiny: None, tmp_path: Path, c
     lazy = np.mean([r["epochs"][-1]["supervisor_actions"] for r in results if r["algorithm"] == LAZY])
     cloning = next(r for r in results if r["algorithm"] == BC)
     assert cloning["config"]["offline_pairs"] == 100 + round(lazy)
-    assert figure_2_3.table(figure_2_3.read(place)) == text
+    assert figure_2_3.table(jobs.read_results(place)) == text
     assert "| Walker2d | -56% |" in text
     assert (place / "figure.png").stat().st_size > 20_000
     assert f"Walker2d {LAZY} seed 1: return" in capsys.readouterr().out

@@ -9,7 +9,6 @@ The tasks have their own level of disturbance, and demonstrations are given in c
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tutelage.envs import experts
-from tutelage.errors import ConfigError, MissingExtraError, RunFolderError
+from tutelage.errors import ConfigError, MissingExtraError
 from tutelage.experiments import plots
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.jobs import Job, resolved, run_jobs, slug, start_or_resume
@@ -185,18 +184,6 @@ def last(results: list[dict[str, Any]], task: str, algorithm: str, name: str) ->
     """A number of the last epoch for each seed, (n,); return_mean as a fraction of the expert's return."""
     mine = [r for r in results if (r["task"], r["algorithm"]) == (task, algorithm)]
     return np.array([r["epochs"][-1][name] / (r["expert_return"] if name == "return_mean" else 1) for r in mine])
-
-
-def read(folder: Path) -> list[dict[str, Any]]:
-    """The small result files below a folder.
-
-    Raises:
-        RunFolderError: a damaged file.
-    """
-    try:
-        return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/*.json"))]
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"a result file in {folder} is damaged: {error}") from None
 
 
 def present(results: list[dict[str, Any]]) -> list[str]:

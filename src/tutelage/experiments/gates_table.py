@@ -95,8 +95,10 @@ def table(results: list[dict[str, Any]]) -> str:
         "| Gate | Successes ↑ | Hard resets ↓ | Human time ↓ | ROHE ↑ | Context switches ↓ |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]
-    for name in dict.fromkeys(r["algorithm"] for r in results):
+    for name in configurations(GatesConfig(c["task"])):
         metrics = [r["metrics"] for r in results if r["algorithm"] == name]
+        if not metrics:
+            continue
         columns = {key: np.array([m[key] for m in metrics]) for key in ("successes", "hard_resets", "human_time", "rohe")}
         columns["switches"] = np.array([m["switches_to_human"] + m["switches_to_robot"] for m in metrics])
         cells = [interval(values, 3 if key == "rohe" else 0) for key, values in columns.items()]

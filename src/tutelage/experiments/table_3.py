@@ -118,7 +118,7 @@ def configuration(setting: Setting, algorithm: str, steps: int | None = None) ->
     gate = {
         SAFE: GateConfig(),  # where 20 % of the offline data are unsafe: 0.008 in the dissertation
         LAZY: GateConfig(beta_h=0.015 / largest, beta_r=0.25, noise=0.02),
-        HG: GateConfig(unsafe=0.01, beta_r=0.5),  # a person steps in where the robot is clearly wrong: set on seed 100
+        HG: GateConfig(unsafe=0.003),  # a person steps in where the robot is clearly wrong: set on seed 100
         NO_NOVELTY: GateConfig(without="novelty"),
         NO_RISK: GateConfig(without="risk"),
     }.get(algorithm, GateConfig(alpha=0.01))
