@@ -61,7 +61,7 @@ def evaluate_policy(
                 f"{config.priority}, U.C. or C."
             ) from None
     tally = tally or Tally(config.robots, config.humans)
-    loop = assembly.loop(frozen=assembly.actor if policy is None else policy)
+    loop = assembly.loop(frozen=assembly.human if policy is None else policy)
     loop.subscribers = [Counting(tally), *subscribers]
     loop.run(config.steps)
     assembly.fleet.close()

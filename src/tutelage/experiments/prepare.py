@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.envs.registry import make_fleet
 from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError
-from tutelage.experiments.assemble import Assembly
+from tutelage.experiments.assemble import Assembly, fleet_of
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.conformal import miss_threshold
 from tutelage.fleet.discrepancy import discrepancy
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import parse
+from tutelage.fleet.supervisor import PolicySupervisor
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
@@ -63,10 +63,10 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
 
 
 def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Array, Array]:
-    """Offline data of the human: obs (n, D) float32, actions (n, A). Whole episodes, one a robot; falls are left out.
+    """Offline data of the human: obs (n, D) float32 or (n, H, W, 3) uint8, actions (n, A).
 
-    Where there is a goal an episode ends with it, those that do not reach it are left out too, and robots demonstrate again
-    until there are pairs enough.
+    Whole episodes, one a robot; falls are left out. Where there is a goal an episode ends with it, those that do not reach
+    it are left out too, and robots demonstrate again until there are pairs enough.
     """
     wanted = config.offline_pairs or MujocoTask.offline_pairs
     episodes = max(1, round(wanted / horizon))
@@ -74,13 +74,13 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
     spare = episodes + 2 + episodes // 4  # the human repeats a demonstration that failed
     # A fleet of the user's own need not know levels; a run on one that does has a level by now.
     level = None if config.disturbance is None else config.offline_disturbance
-    fleet = make_fleet(config.task, spare, disturbance=level, threads=config.threads)
-    goal = fleet.goal_conditioned
+    fleet = fleet_of(config, spare, level)
+    human, goal = PolicySupervisor(actor, fleet), fleet.goal_conditioned
     seed: int | None = derive(config.seed, "demonstrations") % 2**32
     pairs: list[tuple[Array, Array]] = []
     while sum(len(seen) for seen, _ in pairs) < wanted:
         obs, _ = fleet.reset(seed=seed)
-        seen, done, ends, failed = _episodes(fleet, actor, obs, horizon if goal else length)
+        seen, done, ends, failed = _episodes(fleet, human, obs, horizon if goal else length)
         good = np.flatnonzero(~failed)
         if len(good) < (1 if goal else episodes):
             what = "did not reach the goal" if goal else "fell"
@@ -93,18 +93,19 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
     return all_seen[:wanted], all_done[:wanted]
 
 
-def _episodes(fleet: Fleet, actor: Policy, obs: Array, length: int) -> tuple[Array, Array, Array, Array]:
+def _episodes(fleet: Fleet, human: Policy, obs: Array, length: int) -> tuple[Array, Array, Array, Array]:
     """One episode of the human on each robot, from `obs`, of at most so many timesteps.
 
     Returns:
-        obs (T, N, D) float32, actions (T, N, A), the timesteps of each robot (N,), and whether it failed (N,).
+        obs (T, N, D) float32 or (T, N, H, W, 3) uint8, actions (T, N, A), the timesteps of each robot (N,), and whether it
+        failed (N,).
     """
     ends = np.full(fleet.num_envs, length)
     complete = np.zeros(fleet.num_envs, dtype=bool)
     seen, done = [], []
     for t in range(length):
-        action = actor.act(obs)
-        seen.append(obs.astype(np.float32))
+        action = human.act(obs)
+        seen.append(obs if obs.dtype == np.uint8 else obs.astype(np.float32))
         done.append(action)
         obs, _, _, _, info = fleet.step(action)
         if fleet.goal_conditioned:
