@@ -34,6 +34,7 @@ class LevelsConfig:
         task: name of a task.
         levels: levels of disturbance; default: the task's own.
         offline_pairs: state-action pairs that are cloned; default: the task's own.
+        observation: what is cloned from: "state" or "images", in the latter case with the hyper-parameters of appendix B.2.
         episodes: robots, one episode each.
         seed: root seed; one that no comparison uses.
         threads: physics threads.
@@ -43,6 +44,7 @@ class LevelsConfig:
     task: Positional[str]
     levels: tuple[str, ...] = ()
     offline_pairs: int | None = None
+    observation: Literal["state", "images"] = "state"
     episodes: int = 100
     seed: int = 100
     threads: int | None = None
