@@ -25,7 +25,7 @@ except ImportError as error:  # pragma: no cover - exercised in an environment w
 _AZIMUTH, _ELEVATION = 90.0, -15.0  # degrees: from the side, with forward (x) to the right, and a little from above
 _MARGIN = 1.3  # of the robot's own radius
 _SMALL = 128
-"""Pictures of at most so many pixels a side show no corners: round things are drawn with fewer of them, four times as fast."""
+"""Pictures of at most so many pixels a side show no corners: round things are drawn with few, four times as fast."""
 
 
 def gl_backend() -> str:
