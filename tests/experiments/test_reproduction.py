@@ -105,16 +105,19 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def small(*args: Any) -> Any:
         config = make(*args)
-        learner = dataclasses.replace(config.learner, every=20, gradient_steps=5, pretrain=20, batch=16)
+        steps = (
+            {"gradient_steps": 1, "pretrain": 1} if config.observation == "images" else {"gradient_steps": 5, "pretrain": 20}
+        )
+        learner = dataclasses.replace(config.learner, every=20, batch=16, **steps)
         pairs = 120 if config.algorithm != BC else 180
         return dataclasses.replace(
             config, steps=30, checkpoint_every=20, metrics_every=10, learner=learner, hidden=(16,), calibration_steps=10,
-            offline_pairs=pairs, critic=dataclasses.replace(config.critic, pretrain=5, hidden=(16,)),
+            offline_pairs=pairs, members=2, critic=dataclasses.replace(config.critic, pretrain=5, hidden=(16,)),
         )  # fmt: skip
 
     monkeypatch.setattr(table_3, "configuration", small)
-    setting = dataclasses.replace(table_3.SETTINGS["table-3.1"], tests=2, aided=1)
-    monkeypatch.setattr(table_3, "SETTINGS", {"table-3.1": setting})
+    settings = {name: dataclasses.replace(setting, tests=2, aided=1) for name, setting in table_3.SETTINGS.items()}
+    monkeypatch.setattr(table_3, "SETTINGS", settings)
     monkeypatch.setattr(jobs, "ProcessPoolExecutor", Here)
 
 
@@ -132,6 +135,17 @@ def test_table_3_1_from_runs_to_published_and_ours(short: None, tmp_path: Path) 
         reproduction.reproduce("table-3.1", ("Walker2d",), (0,), False, 1, *where)
 
 
+@pytest.mark.render
+def test_table_3_3_is_made_from_images(opengl: None, short: None, tmp_path: Path) -> None:
+    text = reproduction.reproduce("table-3.3", (), (0,), False, 1, tmp_path / "runs", tmp_path / "results")
+    place = tmp_path / "results" / "single" / "table-3.3"
+    results = [json.loads(path.read_text()) for path in sorted(place.glob("*.json"))]
+    assert {r["algorithm"] for r in results} == {table_3.BC, table_3.HG, table_3.THRIFTY}
+    assert {r["config"]["observation"] for r in results} == {"images"}
+    assert "| ThriftyDAgger | published | 1.42 ± 1.14 | 15.2 ± 12.4 | 45.5 ± 18.3 | 12/15 |" in text
+    assert "| Behaviour cloning | published | – | – | – | 0/15 |" in text
+
+
 def test_the_settings_are_those_of_appendix_b_2() -> None:
     setting = table_3.SETTINGS["table-3.1"]
     lazy, thrifty = (table_3.configuration(setting, name) for name in (table_3.LAZY, table_3.THRIFTY))
@@ -140,6 +154,12 @@ def test_the_settings_are_those_of_appendix_b_2() -> None:
     assert (thrifty.gate.alpha, thrifty.critic.gamma, thrifty.critic.positives) == (0.01, 0.9999, 0.1)
     assert table_3.configuration(setting, table_3.BC).offline_pairs == 4004
     assert table_3.configuration(setting, table_3.NO_RISK).gate.without == "risk"
+    seen = table_3.configuration(table_3.SETTINGS["table-3.3"], table_3.THRIFTY)
+    assert (seen.task, seen.observation, seen.steps, seen.offline_pairs) == ("CableRouting", "images", 1500, 1381)
+    assert (seen.learner.batch, seen.learner.learning_rate, seen.learner.pretrain) == (64, 2.5e-4, 5 * 300)
+    assert (seen.learner.every, seen.calibration_steps, seen.members) == (500, 5 * 100, 5)
+    assert (seen.critic.batch, seen.critic.learning_rate, seen.critic.gamma) == (64, 2.5e-4, 0.9999)
+    assert table_3.configuration(table_3.SETTINGS["table-3.3"], table_3.BC).offline_pairs == 1381
 
 
 def test_counts_are_pooled_over_the_episodes_of_all_seeds() -> None:

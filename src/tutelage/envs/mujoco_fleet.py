@@ -174,6 +174,11 @@ class MujocoFleet(Fleet):
         seen, info = self._seen(info)
         return seen, reward, self._violation.copy(), truncated, info
 
+    @property
+    def state(self) -> Array | None:
+        """The task's vectors, (N, D) float64, where images are observed."""
+        return None if self._images is None else self._obs
+
     def _look(self, mask: Mask) -> None:
         """Draw what the robots of the mask (N,) see, if it is images that are observed."""
         if self._images is not None:

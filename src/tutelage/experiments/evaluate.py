@@ -62,7 +62,7 @@ def evaluate_policy(
                 f"{config.priority}, U.C. or C."
             ) from None
     tally = tally or Tally(config.robots, config.humans)
-    loop = assembly.loop(frozen=assembly.actor if policy is None else policy)
+    loop = assembly.loop(frozen=assembly.human if policy is None else policy)
     if learned and priority == config.priority:
         loop.priority.load_state_dict(learned["priority"])
     loop.subscribers = [Counting(tally), *subscribers]

@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.envs.registry import make_fleet
 from tutelage.envs.tasks.base import MujocoTask
 from tutelage.errors import ConfigError
-from tutelage.experiments.assemble import Assembly
+from tutelage.experiments.assemble import Assembly, fleet_of
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.conformal import miss_threshold
 from tutelage.fleet.discrepancy import discrepancy
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import parse
+from tutelage.fleet.supervisor import PolicySupervisor
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
@@ -66,7 +66,10 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
 
 
 class Demonstrations(NamedTuple):
-    """n transitions of the human: obs, next_obs (n, D) float32, actions (n, A), success (n,) bool: the goal was reached."""
+    """n transitions of the human: obs, next_obs (n, D) float32 or (n, H, W, 3) uint8, actions (n, A), success (n,) bool.
+
+    Success: the goal was reached in this step.
+    """
 
     obs: Array
     actions: Array
@@ -86,13 +89,13 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> Demonstrat
     spare = episodes + 2 + episodes // 4  # the human repeats a demonstration that failed
     # A fleet of the user's own need not know levels; a run on one that does has a level by now.
     level = None if config.disturbance is None else config.offline_disturbance
-    fleet = make_fleet(config.task, spare, disturbance=level, threads=config.threads)
-    goal = fleet.goal_conditioned
+    fleet = fleet_of(config, spare, level)
+    human, goal = PolicySupervisor(actor, fleet), fleet.goal_conditioned
     seed: int | None = derive(config.seed, "demonstrations") % 2**32
     episodes_of: list[Demonstrations] = []
     while sum(len(part.obs) for part in episodes_of) < wanted:
         obs, _ = fleet.reset(seed=seed)
-        seen, done, after, ends, failed = _episodes(fleet, actor, obs, horizon if goal else length)
+        seen, done, after, ends, failed = _episodes(fleet, human, obs, horizon if goal else length)
         good = np.flatnonzero(~failed)
         if len(good) < (1 if goal else episodes):
             what = "did not reach the goal" if goal else "fell"
@@ -107,19 +110,19 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> Demonstrat
     return Demonstrations(*(np.concatenate(part)[:wanted] for part in zip(*episodes_of, strict=True)))
 
 
-def _episodes(fleet: Fleet, actor: Policy, obs: Array, length: int) -> tuple[Array, Array, Array, Array, Array]:
+def _episodes(fleet: Fleet, human: Policy, obs: Array, length: int) -> tuple[Array, Array, Array, Array, Array]:
     """One episode of the human on each robot, from `obs`, of at most so many timesteps.
 
     Returns:
-        obs (T, N, D) float32, actions (T, N, A), next_obs (T, N, D) float32, the timesteps of each robot (N,), and whether
-        it failed (N,).
+        obs (T, N, D) float32 or (T, N, H, W, 3) uint8, actions (T, N, A), next_obs like obs, the timesteps of each robot
+        (N,), and whether it failed (N,).
     """
     ends = np.full(fleet.num_envs, length)
     complete = np.zeros(fleet.num_envs, dtype=bool)
     seen, done = [], []
     for t in range(length):
-        action = actor.act(obs)
-        seen.append(obs.astype(np.float32))
+        action = human.act(obs)
+        seen.append(obs)
         done.append(action)
         obs, _, _, _, info = fleet.step(action)
         if fleet.goal_conditioned:
@@ -128,7 +131,9 @@ def _episodes(fleet: Fleet, actor: Policy, obs: Array, length: int) -> tuple[Arr
             if (complete | info["violation"]).all():
                 break
     failed = ~complete if fleet.goal_conditioned else info["violation"]
-    states = np.stack([*seen, obs.astype(np.float32)])
+    states = np.stack([*seen, obs])
+    if states.dtype != np.uint8:  # images are kept as bytes
+        states = states.astype(np.float32)
     return states[:-1], np.stack(done), states[1:], ends, failed
 
 

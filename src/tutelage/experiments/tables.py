@@ -223,6 +223,7 @@ def _level(task: str, level: dict[str, Any]) -> list[str]:
     fits = "yes" if suits(expert, cloned) else "no"
     name = f"**{level['level']}**" if level.get("chosen") else str(level["level"])
     pairs = f"{level['offline_pairs']:,}" if "offline_pairs" in level else ""
+    task = f"{task}, from images" if level.get("observation") == "images" else task
     return [task, name, pairs, f"{expert:.0%}", f"{cloned:.0%}", str(level["episodes"]), fits]
 
 

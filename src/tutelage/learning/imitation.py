@@ -17,7 +17,6 @@ from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.ensemble import EnsemblePolicy
-from tutelage.policies.mlp import BatchedMLP
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import derive
 
@@ -98,13 +97,8 @@ class ImitationLearner:
     def restart(self) -> None:
         """New initial weights and a new optimiser; the data stay."""
         self.restarts += 1
-        generator = torch.Generator().manual_seed(derive(self.seed, f"policy/restart {self.restarts}"))
-        net, old = self.policy.net, self.policy.net.weights
-        widths = [w.shape[1] for w in old] + [old[-1].shape[2]]
-        fresh = BatchedMLP(self.policy.members, widths[0], widths[-1], tuple(widths[1:-1]), generator, net.last)
-        net.load_state_dict(fresh.state_dict())
+        self.policy.restart(derive(self.seed, f"policy/restart {self.restarts}"))
         self.optimiser = adam(self.policy.parameters(), self.config.learning_rate)
-        self.policy.forget()
 
     # -- the Learner of the loop --------------------------------------------------------------------------------
 
