@@ -6,9 +6,7 @@ standard packages define; for others it is left out, which ROS 2 reads as "unkno
 
 from __future__ import annotations
 
-from typing import Any
-
-from tutelage.errors import ConfigError, MissingExtraError
+from tutelage.sgc.proxies.ros_types import type_store
 
 WITHOUT_HASH = ("dashing", "eloquent", "foxy", "galactic", "humble")
 
@@ -32,20 +30,3 @@ class TypeHashes:
         if self._store is None or type_name not in self._store.fielddefs:
             return {}
         return {"typehash": self._store.hash_rihs01(type_name)}
-
-
-def type_store(distribution: str) -> Any:
-    """The types of a distribution, a `rosbags.typesys.store.Typestore`.
-
-    Raises:
-        ConfigError: no such distribution.
-        MissingExtraError: rosbags is not installed.
-    """
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise MissingExtraError("rosbags", "ros2") from None
-    known = {store.name.removeprefix("ROS2_").lower(): store for store in Stores if store.name.startswith("ROS2_")}
-    if distribution not in known:
-        raise ConfigError(f"there is no ROS 2 distribution {distribution!r}; there are {', '.join(sorted(known))}")
-    return get_typestore(known[distribution])

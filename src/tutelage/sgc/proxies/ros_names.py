@@ -1,7 +1,7 @@
 """How ROS 2 names appear in DDS: prefixes of topics, mangled names of types.
 
 /chatter, std_msgs/msg/String      topic rt/chatter, type std_msgs::msg::dds_::String_
-/add, pkg/srv/AddTwoInts           topics rq/addRequest and rr/addReply, types pkg::srv::dds_::AddTwoInts_Request_, ..._Response_
+/add, pkg/srv/AddTwoInts           topics rq/addRequest and rr/addReply, types pkg::srv::dds_::AddTwoInts_Request_, ...
 /fold, pkg/action/Fold             three services and two topics under /fold/_action
 """
 
