@@ -66,14 +66,19 @@ class LoopQueue(Generic[T]):
         self._items: deque[T] = deque(maxlen=size)
         self._loop = loop
         self._filled = asyncio.Event()
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
         self._waking = False
         self.dropped = 0
 
-    def put(self, item: T) -> None:
-        """Add an item; the oldest one goes if the queue is full. Does nothing once the loop is closed."""
-        with self._lock:
-            self.dropped += len(self._items) == self._items.maxlen
+    def put(self, item: T, timeout: float = 0.0) -> None:
+        """Add an item; the oldest one goes if the queue is full. Does nothing once the loop is closed.
+
+        timeout: seconds to wait for room before that. Not on the loop's own thread.
+        """
+        with self._changed:
+            if timeout and self.full:
+                self._changed.wait_for(lambda: not self.full, timeout)
+            self.dropped += self.full
             self._items.append(item)
             wake, self._waking = not self._waking, True
         if wake:
@@ -85,12 +90,18 @@ class LoopQueue(Generic[T]):
     async def get(self) -> T:
         """Wait for the next item."""
         while True:
-            with self._lock:
+            with self._changed:
                 if self._items:
+                    self._changed.notify()
                     return self._items.popleft()
                 self._waking = False
                 self._filled.clear()
             await self._filled.wait()
+
+    @property
+    def full(self) -> bool:
+        """Would the next item push out another one?"""
+        return len(self._items) == self._items.maxlen
 
     def __len__(self) -> int:
         return len(self._items)

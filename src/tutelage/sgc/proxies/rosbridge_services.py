@@ -158,7 +158,8 @@ def rosapi(name: str, arguments: Any, routes: Routes) -> dict[str, Any]:
     topics = {route.name: route.type for route in routes.topics}
     services = {route.name: route.type for route in routes.services}
     given = next(iter(arguments.values()), "") if isinstance(arguments, dict) else ""
-    now = dict(zip(("sec", "nanosec"), divmod(time.time_ns(), 10**9), strict=True))
+    seconds, rest = divmod(time.time_ns(), 10**9)
+    now = {"sec": seconds, "nanosec": rest, "secs": seconds, "nsecs": rest}  # roslibpy asks for the names of ROS 1
     answers: dict[str, dict[str, Any]] = {
         "topics": {"topics": list(topics), "types": list(topics.values())},
         "topic_type": {"type": topics.get(str(given), "")},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,6 @@ from tutelage.sgc.proxies.rosbridge_outbox import MAX_QUEUE, ClientSubscription,
 from tutelage.sgc.proxies.rosbridge_services import Service, ServiceFailed, rosapi
 from tutelage.sgc.proxies.rosbridge_topics import Topic
 from tutelage.sgc.proxies.rosbridge_wire import Defragmenter, dump_json
-from tutelage.sgc.transport.base import Congested
 
 if TYPE_CHECKING:
     from tutelage.sgc.proxies.rosbridge import Bridge
@@ -25,7 +23,6 @@ MAX_CALLS = 32
 MAX_WISHES = 64
 """Subscriptions that one client may hold on one topic."""
 MAX_ID = 200
-_RETRY, _GIVE_UP = 0.005, 2.0  # seconds: a client that publishes faster than the network is held back, then told
 _COMPRESSIONS = ("none", "png", "cbor", "cbor-raw")
 
 
@@ -148,16 +145,7 @@ class Session:
     async def _publish(self, message: dict[str, Any]) -> None:
         topic = self._topic(message)
         self._may_publish(topic)
-        data = topic.codec.serialize(message.get("msg", {}))
-        until = time.monotonic() + _GIVE_UP
-        while True:
-            try:
-                topic.publish(data)
-                return
-            except Congested:
-                if time.monotonic() > until:
-                    raise
-            await asyncio.sleep(_RETRY)  # meanwhile nothing more is read from this client
+        await topic.publish(topic.codec.serialize(message.get("msg", {})))  # until that is done, nothing more is read
 
     def _may_publish(self, topic: Topic) -> None:
         if not topic.route.outward:

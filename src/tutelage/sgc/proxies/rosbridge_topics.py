@@ -7,16 +7,20 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
+from tutelage.sgc.access import Delivery
 from tutelage.sgc.proxies.counts import Counts
 from tutelage.sgc.proxies.queues import LoopQueue
 from tutelage.sgc.proxies.ros_types import RosTypes
 from tutelage.sgc.proxies.ros_values import Codec
 from tutelage.sgc.proxies.rosbridge_wire import dump_cbor, dump_json, dump_png
 from tutelage.sgc.proxies.routes import TopicRoute
+from tutelage.sgc.transport.base import Congested
 
 if TYPE_CHECKING:
     from tutelage.sgc.messages import Message
     from tutelage.sgc.node import Node, Publisher, Subscription
+
+_RETRY, _GIVE_UP = 0.005, 2.0  # seconds: who publishes faster than the network takes it is held back, then told
 
 
 class Codecs:
@@ -101,6 +105,9 @@ class Topic:
         self._node, self._codecs, self._loop = node, codecs, loop
         self._listeners: list[Listener] = []
         self._queue: LoopQueue[tuple[bytes, float]] = LoopQueue(route.queue, loop)
+        # While we wait, the node holds back, and fetches again what it could not hold; lossy topics move on.
+        reliable = node.access.entry(route.alias).rule.delivery is Delivery.RELIABLE
+        self._patience = _GIVE_UP if reliable else 0.0
         self._subscription: Subscription | None = None
         self._task: asyncio.Task[None] | None = None
         self._publisher: Publisher | None = None
@@ -141,15 +148,25 @@ class Topic:
             self._task.cancel()
         return close
 
-    def publish(self, data: bytes) -> None:
+    async def publish(self, data: bytes) -> None:
         """Send a message to the fleet and, as the node does not hear itself, to the clients here.
 
         Raises:
-            NotAllowed, Congested, NoKey: see `Publisher.send`.
+            NotAllowed, Congested, NoKey: see `Publisher.send`; Congested after some time of trying.
         """
+        until = self._loop.time() + _GIVE_UP
+        while self._subscription is not None and self._queue.full and self._loop.time() < until:
+            await asyncio.sleep(_RETRY)
         if self._publisher is None:
             self._publisher = self._node.publisher(self.route.alias)
-        self._publisher.send(data)
+        while True:
+            try:
+                self._publisher.send(data)
+                break
+            except Congested:
+                if self._loop.time() > until:
+                    raise
+            await asyncio.sleep(_RETRY)
         self.counts.add("published")
         if self._subscription is not None:
             self._queue.put((data, 0.0))
@@ -164,7 +181,7 @@ class Topic:
 
     def _on_message(self, message: Message) -> None:
         if message.sender != self._node.name:
-            self._queue.put((bytes(message.payload), message.received))
+            self._queue.put((bytes(message.payload), message.received), self._patience)
 
     async def _deliver(self) -> None:
         while True:
