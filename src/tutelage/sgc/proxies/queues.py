@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections import deque
 from typing import Generic, TypeVar
@@ -75,17 +76,20 @@ class LoopQueue(Generic[T]):
 
         timeout: seconds to wait for room before that. Not on the loop's own thread.
         """
+        if not (timeout and self.offer(item, timeout)):
+            with self._changed:
+                self.dropped += self.full
+                self._items.append(item)
+            self._wake()
+
+    def offer(self, item: T, timeout: float) -> bool:
+        """Add an item; False if there is no room within so many seconds. Not on the loop's own thread."""
         with self._changed:
-            if timeout and self.full:
-                self._changed.wait_for(lambda: not self.full, timeout)
-            self.dropped += self.full
+            if not self._changed.wait_for(lambda: not self.full, timeout):
+                return False
             self._items.append(item)
-            wake, self._waking = not self._waking, True
-        if wake:
-            try:
-                self._loop.call_soon_threadsafe(self._filled.set)
-            except RuntimeError:  # the loop is closed: nobody reads any more
-                return
+        self._wake()
+        return True
 
     async def get(self) -> T:
         """Wait for the next item."""
@@ -105,3 +109,10 @@ class LoopQueue(Generic[T]):
 
     def __len__(self) -> int:
         return len(self._items)
+
+    def _wake(self) -> None:
+        with self._changed:
+            wake, self._waking = not self._waking, True
+        if wake:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody reads any more
+                self._loop.call_soon_threadsafe(self._filled.set)

@@ -7,9 +7,7 @@ machine are let in, others only if listed, as any page in the world could otherw
 from __future__ import annotations
 
 import asyncio
-import hmac
 import http
-import ipaddress
 import logging
 import ssl
 import threading
@@ -20,6 +18,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from tutelage.errors import ConfigError, MissingExtraError
 from tutelage.sgc.proxies.counts import Counts
+from tutelage.sgc.proxies.listen import Tls, check_listen, has_token, is_loopback
 from tutelage.sgc.proxies.ros_types import RosTypes
 from tutelage.sgc.proxies.rosbridge_outbox import TooSlow
 from tutelage.sgc.proxies.rosbridge_services import Service
@@ -45,13 +44,13 @@ class Bridge:
         routes: what clients may use.
         types: definitions of the types.
         host, port: where to listen; port 0: any. `address` tells.
-        token: what clients must bring, as `Authorization: Bearer ...` or `?token=...`; needed off loopback.
+        token: what clients must bring, as `Authorization: Bearer ...` or `?token=...`.
         origins: pages, such as "https://operators.example", whose scripts may connect; "null" for files.
-        tls: for wss://.
+        tls: for wss://; needed off loopback.
 
     Raises:
         MissingExtraError: websockets or rosbags is not installed.
-        ConfigError: not on loopback and without a token, two routes with one name, or the port cannot be had.
+        ConfigError: not on loopback and without protection, two routes with one name, or the port cannot be had.
     """
 
     def __init__(
@@ -64,11 +63,10 @@ class Bridge:
         port: int = 9090,
         token: str | None = None,
         origins: Sequence[str] = (),
-        tls: ssl.SSLContext | None = None,
+        tls: Tls | None = None,
         max_message: int = MAX_MESSAGE,
     ) -> None:
-        if not _is_loopback(host) and not token:
-            raise ConfigError(f"a rosbridge on {host} needs a token, as others than this machine can reach it")
+        check_listen("a rosbridge", host, token, tls)
         self.routes, self.max_message = routes, max_message
         self.counts = Counts("clients", "turned_away", "messages", "refused", "too_slow", "dropped")
         self.loop = asyncio.new_event_loop()
@@ -113,7 +111,7 @@ class Bridge:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    async def _start(self, host: str, port: int, tls: ssl.SSLContext | None) -> None:
+    async def _start(self, host: str, port: int, tls: Tls | None) -> None:
         try:
             from websockets.asyncio.server import serve
         except ImportError:
@@ -127,7 +125,7 @@ class Bridge:
                 max_size=self.max_message,
                 max_queue=4,
                 compression=None,
-                ssl=tls,
+                ssl=_ssl(tls) if tls is not None else None,
                 logger=logging.getLogger(f"{__name__}.websockets"),
             )
         except OSError as error:
@@ -156,13 +154,11 @@ class Bridge:
             host = urlsplit(origin).hostname
         except ValueError:
             return False
-        return host is not None and _is_loopback(host)
+        return host is not None and is_loopback(host)
 
     def _has_token(self, request: Any) -> bool:
-        given = [value.removeprefix("Bearer ") for value in request.headers.get_all("Authorization")]
-        given += parse_qs(urlsplit(request.path).query).get("token", [])
-        wanted = (self._token or "").encode()
-        return any(hmac.compare_digest(token.encode(), wanted) for token in given)
+        given = request.headers.get_all("Authorization") + parse_qs(urlsplit(request.path).query).get("token", [])
+        return has_token(given, self._token or "")
 
     async def _serve(self, connection: Any) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -210,8 +206,13 @@ class Bridge:
             self.loop.close()
 
 
-def _is_loopback(host: str) -> bool:
+def _ssl(tls: Tls) -> ssl.SSLContext:
+    tls.read()  # for its error
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=tls.clients)
     try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+        context.load_cert_chain(tls.certificate, tls.key)
+    except ssl.SSLError as error:
+        raise ConfigError(f"cannot use {tls.certificate} with {tls.key}: {error}") from None
+    if tls.clients is not None:
+        context.verify_mode = ssl.CERT_REQUIRED
+    return context
