@@ -1,8 +1,8 @@
 """Keys of topics: one a topic and epoch, made by the topic's owner, sealed to each member (HPKE), signed by the owner.
 
-Members ask the owner (`ask`, `answer`, `accept`); all three are plain bytes that any channel may carry and any file may hold.
-The owner changes the key from time to time and whenever somebody is revoked; an epoch also ends by itself, so that revocation
-holds even if no message about it arrives.
+Members ask the owner (`ask`, `answer`, `accept`); all three are plain bytes that any channel may carry and any file hold.
+The owner changes the key from time to time and whenever somebody is revoked; an epoch also ends by itself, so that
+revocation holds even if no message about it arrives.
 """
 
 from __future__ import annotations
