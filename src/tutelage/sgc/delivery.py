@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field
 
+from tutelage.sgc.frames import age_of
 from tutelage.sgc.sealing import Opened
 
 PATIENCE = 5.0
@@ -91,11 +92,8 @@ class Delivery(ABC):
         self._past: deque[bytes] = deque(maxlen=256)  # salts of earlier starts
 
     @abstractmethod
-    def accept(self, message: Opened, age: float, now: float) -> list[Opened]:
-        """Take a message; returns those that are to be delivered now.
-
-        age: seconds since its sender began the stream.
-        """
+    def accept(self, message: Opened, now: float) -> list[Opened]:
+        """Take a message, with its frame; returns those that are to be delivered now."""
 
     def due(self, now: float) -> list[Opened]:
         """What is to be delivered because time has passed."""
@@ -112,11 +110,15 @@ class Delivery(ABC):
         """
         return []
 
+    def salts(self) -> set[bytes]:
+        """Of the senders' present starts."""
+        return {stream.salt for stream in self._current.values()}
+
     def wake(self) -> float | None:
         """When `due` or `questions` will have something, at the earliest."""
         return None
 
-    def _stream(self, message: Opened, age: float, now: float) -> tuple[Stream | None, list[Opened]]:
+    def _stream(self, message: Opened, now: float) -> tuple[Stream | None, list[Opened]]:
         """The stream of a message, None if its sender has started again since; and what its predecessor still held."""
         stream = self._current.get(message.sender)
         if stream is not None and stream.salt == message.salt:
@@ -128,7 +130,7 @@ class Delivery(ABC):
             self._past.append(stream.salt)
             left = self._release_all(stream, now)
         # Begun after us: whatever came before this message was meant for us too.
-        ours = age <= now - self.started + SLACK
+        ours = age_of(message.payload) <= now - self.started + SLACK
         first = 1 if ours else message.sequence
         stream = self._current[message.sender] = Stream(message.sender, message.salt, first, patience=self.patience)
         return stream, left
@@ -140,8 +142,8 @@ class Delivery(ABC):
 class InOrder(Delivery):
     """Every message, in order. What is missing is asked for, and given up only when the publisher cannot give it."""
 
-    def accept(self, message: Opened, age: float, now: float) -> list[Opened]:
-        stream, ready = self._stream(message, age, now)
+    def accept(self, message: Opened, now: float) -> list[Opened]:
+        stream, ready = self._stream(message, now)
         if stream is None or message.sequence < stream.next or message.sequence in stream.held:
             self.tally.late += 1
             return ready
@@ -222,8 +224,8 @@ class InOrder(Delivery):
 class Newest(Delivery):
     """Messages as they come, never one older than the last. What is missing is counted and not asked for."""
 
-    def accept(self, message: Opened, age: float, now: float) -> list[Opened]:
-        stream, _ = self._stream(message, age, now)
+    def accept(self, message: Opened, now: float) -> list[Opened]:
+        stream, _ = self._stream(message, now)
         if stream is None or message.sequence < stream.next:
             self.tally.late += 1
             return []

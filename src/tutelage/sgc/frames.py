@@ -66,6 +66,11 @@ def pieces(payload: memoryview, age: float) -> list[bytes]:
     ]
 
 
+def age_of(payload: bytes | memoryview) -> float:
+    """Seconds since the sender began the stream; without end if the frame is too short to tell."""
+    return float(_HEAD.unpack_from(payload)[1]) / 1000 if len(payload) >= _HEAD.size else float("inf")
+
+
 def parse(payload: bytes | memoryview) -> Frame:
     """Read a frame.
 
