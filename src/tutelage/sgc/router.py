@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from tutelage.sgc.acl import access_control
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.transport.config import Endpoint, Identity, Timers, import_zenoh, zenoh_config, zenoh_settings
+from tutelage.sgc.transport.tunnel import TunnelServer
 
 if TYPE_CHECKING:
     import zenoh
@@ -76,6 +78,11 @@ class Router:
         self.refusals = Refusals()
         self._zenoh = import_zenoh()
         self._session: zenoh.Session | None = None
+        self._identity = Identity(home.root_file, home.leaf_file, home.key_file)
+        self._listen = [each for each in config.listen if each.protocol in ("tls", "quic")]
+        if len(self._listen) < len(config.listen):
+            self._listen.append(Endpoint("tls", "127.0.0.1", _free_port()))  # where tunnels end
+        self._tunnels: list[TunnelServer] = []
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="sgc-router", daemon=True)
 
@@ -117,9 +124,8 @@ class Router:
         return access_control(access.routes, access.members - access.routers, access.routers, access.control, denied)
 
     def _settings(self) -> dict[str, Any]:
-        home = self.home
-        settings = zenoh_settings("router", self.config.timers, Identity(home.root_file, home.leaf_file, home.key_file))
-        settings["listen"] = {"endpoints": [str(each) for each in self.config.listen], "exit_on_failure": True}
+        settings = zenoh_settings("router", self.config.timers, self._identity)
+        settings["listen"] = {"endpoints": [str(each) for each in self._listen], "exit_on_failure": True}
         settings["connect"] |= {
             "endpoints": [str(each) for each in self.config.mesh],
             "timeout_ms": -1,
@@ -137,10 +143,17 @@ class Router:
             raise ConfigError(f"{self.home.name} cannot listen on {where}: {str(error).split(' at /')[0]}") from None
         self._session = session
         self.starts += 1
+        inner = self._listen[-1].port
+        for each in self.config.listen:
+            if each.protocol in ("ws", "wss"):
+                self._tunnels.append(TunnelServer(each, inner, self._identity))
         deny = lanes.key(self.home.access.control, lanes.DENY)
         session.declare_subscriber(deny, self._zenoh.handlers.Callback(self._on_deny, indirect=True))
 
     def _end(self) -> None:
+        for tunnel in self._tunnels:
+            tunnel.close()
+        self._tunnels.clear()
         session, self._session = self._session, None
         if session is not None:
             session.close()
@@ -177,7 +190,14 @@ class Router:
         until = time.monotonic() + 10.0
         while True:
             try:
-                return begin()
+                begin()
+                return
             except ConfigError:
                 if time.monotonic() > until or self._closed.wait(0.1):
                     raise
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
