@@ -89,6 +89,27 @@ class Access:
                 f"add it to the policy of {self.fleet}, then: tutelage keys issue --policy"
             ) from None
 
+    def check(self, alias: str, lane: Lane, *, sends: bool) -> Entry:
+        """The topic of an alias, if this node may send (or receive) on a lane of it.
+
+        Raises:
+            NotAllowed: the message names the node and the remedy.
+        """
+        entry = self.entry(alias)
+        rule = entry.rule
+        if lane not in rule.lanes():
+            raise NotAllowed(f"{alias} is a {rule.kind} in the policy of {self.fleet}, so it has no {lane} lane")
+        if not (rule.may_send if sends else rule.may_receive)(self.node, lane):
+            field = {
+                (Lane.STREAM, True): "publish", (Lane.STREAM, False): "subscribe", (Lane.REQUEST, True): "request",
+                (Lane.REQUEST, False): "serve", (Lane.REPLY, True): "serve", (Lane.REPLY, False): "request",
+            }[lane, sends]  # fmt: skip
+            raise NotAllowed(
+                f"{self.node} is not in {field} of topic {alias!r}; add it to the policy of {self.fleet}, "
+                f"then: tutelage keys issue --policy"
+            )
+        return entry
+
     def to_json(self) -> str:
         """As text, to be signed and sealed: it holds secrets."""
         content: dict[str, Any] = {
