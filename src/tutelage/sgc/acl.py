@@ -29,8 +29,17 @@ WATCH = (
     ("egress", "liveliness_token"),
     ("egress", "reply"),
 )
-MESSAGES = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable")
-MESSAGES += ("liveliness_token", "declare_liveliness_subscriber", "liveliness_query")
+MESSAGES = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+)
 
 _Grants = dict[str, dict[tuple[str, str], list[str]]]  # pseudonym -> (flow, message) -> keys
 

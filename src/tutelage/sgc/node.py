@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from tutelage.errors import TutelageError
-from tutelage.sgc import lanes
+from tutelage.sgc import health, lanes
 from tutelage.sgc.access import Access, Entry, Kind, Lane
 from tutelage.sgc.errors import NotAllowed
 from tutelage.sgc.home import Home
@@ -80,9 +80,7 @@ class Node:
             self._handles += self._exchange_keys(alias, entry)
         self._deny_key = lanes.key(self.access.control, lanes.DENY)
         self._handles.append(transport.subscribe(self._deny_key, self._on_deny))
-        self._presence = Presence(
-            self.keyring, self.access.topics, home.pseudonym, transport, lambda alias: self._need_key(), self._pool
-        )
+        self._presence = Presence(self.keyring, self.access.topics, home.pseudonym, transport, self._need_key, self._pool)
         self._thread = threading.Thread(target=self._tend, name="sgc-tend", daemon=True)
         self._thread.start()
 
@@ -215,8 +213,10 @@ class Node:
             return
         self._closed.set()
         self._wake.set()
-        for part in [*self._publishers.values(), *self._subscriptions]:
-            part.close()
+        for publisher in self._publishers.values():
+            publisher.close()
+        for subscription in self._subscriptions:
+            subscription.close()
         for handle in self._handles:
             handle.close()
         if self._presence is not None:
@@ -233,11 +233,29 @@ class Node:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
+    def publishers(self) -> dict[str, Publisher]:
+        """Those that are open, by alias."""
+        with self._lock:
+            return {alias: each for alias, each in self._publishers.items() if not each.closed}
+
+    def subscriptions(self) -> list[Subscription]:
+        """Those that are open."""
+        with self._lock:
+            return [each for each in self._subscriptions if not each.closed]
+
+    def requesters(self) -> dict[str, Requester]:
+        """By alias."""
+        with self._lock:
+            return dict(self._requesters)
+
+    def servers(self) -> dict[str, Server]:
+        """By alias."""
+        with self._lock:
+            return dict(self._servers)
+
     def counters(self) -> dict[str, Any]:
         """Everything that is counted; see `health`."""
-        from tutelage.sgc.health import counters
-
-        return counters(self)
+        return health.counters(self)
 
     def _entry(self, alias: str, kind: Kind) -> Entry:
         entry = self.access.entry(alias)

@@ -45,7 +45,7 @@ class Presence:
         topics: Mapping[str, Entry],
         pseudonym: str,
         transport: Transport,
-        need_key: Callable[[str], None],
+        need_key: Callable[[], None],
         pool: Executor,
     ) -> None:
         self.directory = Directory(transport)
@@ -56,21 +56,9 @@ class Presence:
         self._known: dict[str, tuple[str, float]] = {}  # pseudonym -> name, round trip in seconds
         self._handles: list[Handle] = []
         self._requesters: dict[tuple[str, str], Requester] = {}
-        self._make_requester = lambda alias, key, who: Requester(
-            alias,
-            lanes.key(key, lanes.ECHO, who),
-            Sealer(keyring, alias, Lane.PRESENCE),
-            Opener(keyring, alias, Lane.PRESENCE),
-            transport,
-            lambda: need_key(alias),
-        )
+        self._keyring, self._transport, self._need_key = keyring, transport, need_key
         for alias, entry in topics.items():
-            server = Server(
-                alias,
-                Sealer(keyring, alias, Lane.PRESENCE),
-                Opener(keyring, alias, Lane.PRESENCE),
-                lambda asked: asked.payload,
-            )
+            server = Server(alias, *self._ends(alias), lambda asked: asked.payload)
             self._handles += [
                 transport.serve(lanes.key(entry.name, lanes.ECHO, pseudonym), server.answer),
                 self.directory.publish(entry.name, pseudonym),
@@ -111,6 +99,9 @@ class Presence:
             handle.close()
         self.directory.close()
 
+    def _ends(self, alias: str) -> tuple[Sealer, Opener]:
+        return Sealer(self._keyring, alias, Lane.PRESENCE), Opener(self._keyring, alias, Lane.PRESENCE)
+
     def _present(self) -> dict[str, list[str]]:
         """Aliases by pseudonym."""
         present: dict[str, list[str]] = {}
@@ -129,7 +120,9 @@ class Presence:
         with self._lock:
             requester = self._requesters.get((alias, who))
             if requester is None:
-                requester = self._make_requester(alias, self._topics[alias].name, who)
+                sealer, opener = self._ends(alias)
+                key = lanes.key(self._topics[alias].name, lanes.ECHO, who)
+                requester = Requester(alias, key, sealer, opener, self._transport, self._need_key)
                 self._requesters[alias, who] = requester
         start = time.perf_counter()
         reply = requester.request(b"", timeout)

@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -46,7 +46,7 @@ class RouterConfig:
 
     listen: tuple[Endpoint, ...]
     mesh: tuple[Endpoint, ...] = ()
-    timers: Timers = Timers()
+    timers: Timers = field(default_factory=Timers)
 
     @classmethod
     def of(cls, listen: Sequence[str], mesh: Sequence[str] = (), timers: Timers | None = None) -> RouterConfig:
@@ -110,6 +110,11 @@ class Router:
         self.close()
 
     @property
+    def running(self) -> bool:
+        """Does it listen?"""
+        return self._session is not None
+
+    @property
     def links(self) -> list[tuple[str, bool]]:
         """Who is connected: pseudonym or address, and whether it is a router."""
         session = self._session
@@ -121,7 +126,7 @@ class Router:
     def rules(self) -> dict[str, Any]:
         """The access control that the home's policy and deny list call for now."""
         access, denied = self.home.access, self.home.trust.deny_list.pseudonyms
-        return access_control(access.routes, access.members - access.routers, access.routers, access.control, denied)
+        return access_control(access.routes, access.members, access.routers, access.control, denied)
 
     def _settings(self) -> dict[str, Any]:
         settings = zenoh_settings("router", self.config.timers, self._identity)

@@ -18,7 +18,7 @@ from tutelage.errors import TutelageError
 from tutelage.sgc.errors import NoKey
 from tutelage.sgc.messages import Message
 from tutelage.sgc.reasons import Reason, Refused
-from tutelage.sgc.sealing import Opener, Sealer
+from tutelage.sgc.sealing import Opener, Sealer, ident
 from tutelage.sgc.transport.base import NoReply, Transport
 
 log = logging.getLogger(__name__)
@@ -73,9 +73,7 @@ class Requester:
         why = f"nobody answered {self.alias} within {timeout:g} s"
         while (left := until - time.monotonic()) > 0:
             try:
-                with self._lock:
-                    packet = self._sealer.seal(body)
-                    ident = self._sealer.ident
+                packet = self._sealer.seal(body)
             except NoKey as error:
                 self._need_key()
                 why = str(error)
@@ -88,7 +86,7 @@ class Requester:
                 continue
             status = reply[0] if reply else Status.SEALED
             if status == Status.SEALED:
-                return self._read(reply[1:], ident)
+                return self._read(reply[1:], ident(packet))
             why = f"a server of {self.alias} answered, but it does not know us or our key yet"
             self._sealer.introduce()
             self._need_key()
@@ -96,10 +94,10 @@ class Requester:
         self.unanswered += 1
         raise NoReply(why)
 
-    def _read(self, reply: bytes, ident: bytes) -> Message:
+    def _read(self, reply: bytes, bind: bytes) -> Message:
         received = time.time()
         try:
-            opened = self.opener.open(reply, bind=ident)
+            opened = self.opener.open(reply, bind=bind)
         except Refused as refused:
             self.unanswered += 1
             raise NoReply(f"the reply of {self.alias} was refused: {refused}") from None
