@@ -1,133 +1,20 @@
-"""Who may say and hear what. One file of the fleet, the policy (TOML), decides; each node is told only its part of it.
-
-version = 1
-
-[topics.camera]
-node = "drone-1"                    # metadata: with the topic's secret it gives the name
-interface = "/camera"
-type = "sensor_msgs/msg/Image"
-owner = "drone-1"                   # hands out the topic's keys
-publish = ["drone-1"]
-subscribe = ["server", "operator-*"]
-authenticity = "signature"          # or "session", "chain"
-delivery = "lossy"                  # or "reliable"
-max_age = 0.5                       # seconds
-"""
+"""Who may say and hear what: the rules of one topic, and the part of the fleet's policy that one node is told."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from enum import StrEnum
-from pathlib import Path
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
-from tutelage.sgc.names import Name, Topic
+from tutelage.errors import ConfigError
+from tutelage.sgc.errors import NotAllowed
+from tutelage.sgc.names import SECRET_BYTES, Name
+from tutelage.sgc.reasons import Reason, Refused
+from tutelage.sgc.rules import Authenticity, Delivery, Kind, Lane, Role, TopicRule
 
-
-class Kind(StrEnum):
-    """What a topic is."""
-
-    STREAM = "stream"  # publishers -> subscribers
-    SERVICE = "service"  # requesters -> servers, and replies back
-
-
-class Authenticity(StrEnum):
-    """How a receiver knows who sent a message of a topic. The key of a topic is shared by its members, so it cannot tell."""
-
-    SIGNATURE = "signature"  # an Ed25519 signature a message or batch
-    SESSION = "session"  # a tag a message under a key that only sender and receiver have; for a few receivers
-    CHAIN = "chain"  # one signature for many messages, sent after them
-
-
-class Delivery(StrEnum):
-    """What the transport does when it cannot keep up."""
-
-    RELIABLE = "reliable"  # gaps are noticed and replayed
-    LOSSY = "lossy"  # the newest wins
-
-
-class Lane(StrEnum):
-    """Which way a message goes. A packet of one lane is refused on every other one."""
-
-    STREAM = "stream"
-    REQUEST = "request"
-    REPLY = "reply"
-
-
-class Role(StrEnum):
-    """What a certificate is for."""
-
-    NODE = "node"
-    ROUTER = "router"
-
-
-@dataclass(frozen=True)
-class TopicRule:
-    """One topic of the policy. Names of nodes may hold the wildcards of a shell, such as "operator-*".
-
-    Attributes:
-        alias: what the policy, and so every program, calls it.
-        topic: its metadata.
-        owner: the node that makes and hands out its keys; one name.
-        publish, subscribe: who may, for a stream.
-        serve, request: who may, for a service.
-        max_age: seconds after which a message is refused, None for no limit.
-        rotate_every: seconds after which the owner changes the topic's key; a key is refused at twice this age.
-    """
-
-    alias: str
-    topic: Topic
-    owner: str
-    kind: Kind = Kind.STREAM
-    publish: tuple[str, ...] = ()
-    subscribe: tuple[str, ...] = ()
-    serve: tuple[str, ...] = ()
-    request: tuple[str, ...] = ()
-    authenticity: Authenticity = Authenticity.SIGNATURE
-    delivery: Delivery = Delivery.RELIABLE
-    max_age: float | None = None
-    rotate_every: float = 3600.0
-
-    def may_send(self, node: str, lane: Lane = Lane.STREAM) -> bool:
-        """May this node send on this lane?"""
-        raise NotImplementedError
-
-    def may_receive(self, node: str, lane: Lane = Lane.STREAM) -> bool:
-        """May this node receive on this lane?"""
-        raise NotImplementedError
-
-    def is_member(self, node: str) -> bool:
-        """May this node hold the topic's key: owner, or sender or receiver on any lane?"""
-        raise NotImplementedError
-
-    def lanes(self) -> tuple[Lane, ...]:
-        """STREAM for a stream, REQUEST and REPLY for a service."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class Policy:
-    """All topics of a fleet, by alias."""
-
-    topics: Mapping[str, TopicRule]
-
-    @classmethod
-    def parse(cls, text: str) -> Policy:
-        """Read a policy.
-
-        Raises:
-            ConfigError: not TOML, an unknown field, or an impossible combination; the message names the topic.
-        """
-        raise NotImplementedError
-
-    @classmethod
-    def load(cls, path: Path) -> Policy:
-        """Read a policy file.
-
-        Raises:
-            ConfigError: see `parse`; the message names the file.
-        """
-        raise NotImplementedError
+__all__ = ["Access", "Authenticity", "Delivery", "Entry", "Kind", "Lane", "Role", "Route", "TopicRule"]
 
 
 @dataclass(frozen=True)
@@ -135,12 +22,12 @@ class Entry:
     """A topic as a member knows it: the rule and the secret that gives the name."""
 
     rule: TopicRule
-    secret: bytes  # 32 bytes
+    secret: bytes = field(repr=False)  # 32 bytes
 
-    @property
+    @cached_property
     def name(self) -> Name:
         """The topic's name in the network."""
-        raise NotImplementedError
+        return Name.of(self.rule.topic, self.secret)
 
 
 @dataclass(frozen=True)
@@ -172,8 +59,11 @@ class Access:
         serial: counts up with every change; an older one is refused.
         topics: by alias, only those in which the node has a part.
         control: name of the fleet's own channel, for notices such as the deny list; all members know it.
+        secret: 32 bytes that all nodes of the fleet know and no router does; hides names of nodes on the control channel.
+            Empty for routers.
         routes: for routers only.
-        members: for routers only: pseudonyms of all members with a valid certificate.
+        members: for routers only: pseudonyms of all nodes that are not revoked.
+        routers: for routers only: pseudonyms of all routers that are not revoked.
     """
 
     fleet: str
@@ -181,8 +71,10 @@ class Access:
     serial: int
     topics: Mapping[str, Entry]
     control: Name
+    secret: bytes = field(default=b"", repr=False)
     routes: tuple[Route, ...] = ()
     members: frozenset[str] = frozenset()
+    routers: frozenset[str] = frozenset()
 
     def entry(self, alias: str) -> Entry:
         """The topic of an alias.
@@ -190,4 +82,90 @@ class Access:
         Raises:
             NotAllowed: the node has no part in such a topic; the message names the node and the remedy.
         """
-        raise NotImplementedError
+        try:
+            return self.topics[alias]
+        except KeyError:
+            known = f"its topics are {', '.join(sorted(self.topics))}" if self.topics else "it has none"
+            raise NotAllowed(
+                f"the policy gives {self.node} no part in a topic {alias!r} ({known}); "
+                f"add it to the policy of {self.fleet}, then: tutelage keys issue --policy"
+            ) from None
+
+    def check(self, alias: str, lane: Lane, *, sends: bool) -> Entry:
+        """The topic of an alias, if this node may send (or receive) on a lane of it.
+
+        Raises:
+            NotAllowed: the message names the node and the remedy.
+        """
+        entry = self.entry(alias)
+        rule = entry.rule
+        if lane not in rule.lanes():
+            raise NotAllowed(f"{alias} is a {rule.kind} in the policy of {self.fleet}, so it has no {lane} lane")
+        if not (rule.may_send if sends else rule.may_receive)(self.node, lane):
+            field = {
+                (Lane.STREAM, True): "publish", (Lane.STREAM, False): "subscribe", (Lane.REQUEST, True): "request",
+                (Lane.REQUEST, False): "serve", (Lane.REPLY, True): "serve", (Lane.REPLY, False): "request",
+            }[lane, sends]  # fmt: skip
+            raise NotAllowed(
+                f"{self.node} is not in {field} of topic {alias!r}; add it to the policy of {self.fleet}, "
+                f"then: tutelage keys issue --policy"
+            )
+        return entry
+
+    def to_json(self) -> str:
+        """As text, to be signed and sealed: it holds secrets."""
+        content: dict[str, Any] = {
+            "fleet": self.fleet,
+            "node": self.node,
+            "serial": self.serial,
+            "control": self.control.hex(),
+            "secret": self.secret.hex(),
+            "topics": {
+                alias: {"rule": entry.rule.to_table(), "secret": entry.secret.hex()} for alias, entry in self.topics.items()
+            },
+            "routes": [
+                [route.name.hex(), route.kind, route.owner, sorted(route.send), sorted(route.receive)]
+                for route in self.routes
+            ],
+            "members": sorted(self.members),
+            "routers": sorted(self.routers),
+        }
+        return json.dumps(content, sort_keys=True, separators=(",", ":"))
+
+    @classmethod
+    def from_json(cls, text: str) -> Access:
+        """Read what `to_json` gave.
+
+        Raises:
+            Refused: MALFORMED.
+        """
+        try:
+            content = json.loads(text)
+            topics = {
+                str(alias): Entry(TopicRule.from_table(alias, topic["rule"]), _secret(topic["secret"]))
+                for alias, topic in content["topics"].items()
+            }
+            routes = tuple(
+                Route(Name(bytes.fromhex(name)), Kind(kind), str(owner), frozenset(send), frozenset(receive))
+                for name, kind, owner, send, receive in content["routes"]
+            )
+            return cls(
+                fleet=str(content["fleet"]),
+                node=str(content["node"]),
+                serial=int(content["serial"]),
+                topics=topics,
+                control=Name(bytes.fromhex(content["control"])),
+                secret=bytes.fromhex(content["secret"]),
+                routes=routes,
+                members=frozenset(content["members"]),
+                routers=frozenset(content["routers"]),
+            )
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, ConfigError) as error:
+            raise Refused(Reason.MALFORMED, f"not a part of a policy: {error}") from None
+
+
+def _secret(text: str) -> bytes:
+    secret = bytes.fromhex(text)
+    if len(secret) != SECRET_BYTES:
+        raise ValueError(f"a topic's secret has {len(secret)} bytes")
+    return secret

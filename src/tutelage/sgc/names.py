@@ -1,8 +1,8 @@
 """Globally unique, location-independent names of topics: 256 bits, from which nothing can be read (section 8.4).
 
-The dissertation hashes a topic's metadata with SHA-256. Metadata such as "/camera" can be guessed, and a bare hash confirms the
-guess; so a name is HMAC-SHA256 under a secret that only the members of the topic and the fleet's authority hold. It stays
-deterministic: whoever holds metadata and secret derives the same name, anywhere.
+The dissertation hashes a topic's metadata with SHA-256. Metadata such as "/camera" can be guessed, and a bare hash confirms
+the guess; so a name is HMAC-SHA256 under a secret that only the members of the topic and the fleet's authority hold. It
+stays deterministic: whoever holds metadata and secret derives the same name, anywhere.
 """
 
 from __future__ import annotations

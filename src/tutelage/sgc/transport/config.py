@@ -160,7 +160,8 @@ def zenoh_settings(mode: str, timers: Timers, identity: Identity | None) -> dict
             tls[f"{side}_private_key"] = str(identity.key)
     return {
         "mode": mode,
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        # The delay is spent waiting for answers to scouting, even if that is off: half a second at each start of a router.
+        "scouting": {"delay": 1, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "adminspace": {"enabled": False},
         "plugins_loading": {"enabled": False},
         "connect": {

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.transport.base import Handle, NoReply, Transport, check_key
-from tutelage.sgc.transport.config import Identity, NetworkConfig, import_zenoh, zenoh_config, zenoh_settings
+from tutelage.sgc.transport.config import Endpoint, Identity, NetworkConfig, import_zenoh, zenoh_config, zenoh_settings
+from tutelage.sgc.transport.tunnel import TunnelClient
 
 if TYPE_CHECKING:
     import zenoh
@@ -71,6 +72,7 @@ class ZenohTransport(Transport):
         self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
         self._session: zenoh.Session | None = None
         self._closed = threading.Event()
+        self._tunnels: dict[Endpoint, TunnelClient] = {}
         self._pool = ThreadPoolExecutor(SERVING, "sgc-serve")
         self._room = threading.BoundedSemaphore(SERVING + WAITING)
         self._check_identity()
@@ -166,6 +168,8 @@ class ZenohTransport(Transport):
             self._publishers.clear()
         if session is not None:
             session.close()
+        for tunnel in self._tunnels.values():
+            tunnel.close()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     # -- connecting ---------------------------------------------------------------------------------------------------------
@@ -178,13 +182,24 @@ class ZenohTransport(Transport):
     def _open(self) -> zenoh.Session | None:
         """A session with the first router that answers; None: none does."""
         settings = zenoh_settings("client", self.network.timers, self.identity)
-        settings["connect"] |= {"endpoints": [str(each) for each in self.network.routers], "timeout_ms": 0}
+        settings["connect"] |= {"endpoints": [self._locator(each) for each in self.network.routers], "timeout_ms": 0}
         settings["connect"]["exit_on_failure"] = True
         try:
             return self._zenoh.open(zenoh_config(settings))  # type: ignore[no-any-return]
         except self._zenoh.ZError as error:
             log.info("no router answers: %s", str(error).split(" at /")[0])
             return None
+
+    def _locator(self, router: Endpoint) -> str:
+        """Where Zenoh connects to in order to reach a router."""
+        if router.protocol not in ("ws", "wss"):
+            return str(router)
+        if self.identity is None:
+            raise ConfigError(f"{router} needs certificates: TLS runs inside the WebSocket")
+        with self._lock:
+            if router not in self._tunnels:
+                self._tunnels[router] = TunnelClient(router, self.identity)
+            return self._tunnels[router].endpoint
 
     def _connect(self) -> bool:
         session = self._open()
