@@ -1,7 +1,7 @@
 """A gRPC gateway to the fleet's topics and services, for programs in any language; tutelage.proto says what it offers.
 
-On loopback, or on a Unix socket, by default. The nodes' own certificates (Ed25519) cannot be used for its TLS: gRPC's library
-does not accept such keys. So it takes certificates of your own, and clients prove themselves by certificate or token.
+On loopback by default, or on a Unix socket. The nodes' own certificates (Ed25519) cannot be used for its TLS, as gRPC's
+library does not accept such keys. So it takes certificates of your own, and clients prove themselves by certificate or token.
 """
 
 from __future__ import annotations
@@ -95,11 +95,8 @@ class Gateway:
         }
         handlers = {}
         for name, (client_streams, server_streams, asked, answered) in methods().items():
-            kinds = (
-                f"{'stream' if client_streams else 'unary'}_{'stream' if server_streams else 'unary'}",
-                "rpc_method_handler",
-            )
-            handler = getattr(grpc, "_".join(kinds))
+            ways = ("stream" if streams else "unary" for streams in (client_streams, server_streams))
+            handler = getattr(grpc, "_".join((*ways, "rpc_method_handler")))
             handlers[name] = handler(
                 behaviours[name], request_deserializer=asked.FromString, response_serializer=answered.SerializeToString
             )

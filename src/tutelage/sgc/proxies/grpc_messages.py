@@ -1,8 +1,8 @@
 """The messages of tutelage.proto, from its compiled descriptor.
 
-Code that protoc generates for Python is tied to a range of protobuf versions; the descriptor is not. It is compiled by
+Code that protoc generates for Python is tied to a range of protobuf versions; the descriptor is not. It is compiled, here, by
 
-    python -m grpc_tools.protoc -I src/tutelage/sgc/proxies --descriptor_set_out=src/tutelage/sgc/proxies/tutelage.binpb tutelage.proto
+    python -m grpc_tools.protoc -I. --descriptor_set_out=tutelage.binpb tutelage.proto
 
 and a test compares it with tutelage.proto.
 """

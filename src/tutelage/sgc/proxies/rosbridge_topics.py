@@ -18,7 +18,9 @@ from tutelage.sgc.transport.base import Congested
 
 if TYPE_CHECKING:
     from tutelage.sgc.messages import Message
-    from tutelage.sgc.node import Node, Publisher, Subscription
+    from tutelage.sgc.node import Node
+    from tutelage.sgc.publisher import Publisher
+    from tutelage.sgc.subscription import Subscription
 
 _RETRY, _GIVE_UP = 0.005, 2.0  # seconds: who publishes faster than the network takes it is held back, then told
 

@@ -10,7 +10,7 @@ name = "/camera/image_raw"        # on this side; default: the interface of the 
 type = "sensor_msgs/msg/Image"    # default: the type of the policy
 qos = "sensor_data"               # ROS 2: a profile, or a table of policies
 domain = 0                        # ROS 2: the DDS domain
-queue = 64                        # messages that wait each way before the oldest is dropped
+queue = 64                        # messages that wait each way; default: 64, on a lossy topic 1, the newest
 
 [[service]]
 alias = "grasp"
@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 from tutelage.errors import ConfigError
-from tutelage.sgc.access import Access, Kind, Lane
+from tutelage.sgc.access import Access, Delivery, Kind, Lane
 from tutelage.sgc.proxies.ros_names import full_name, full_type
 from tutelage.sgc.proxies.ros_qos import PROFILES, QosProfile, parse_qos
 
@@ -210,7 +210,7 @@ def _topic(table: _Table, access: Access) -> TopicRoute:
         inward=direction in ("in", "both"),
         qos=table.qos("default"),
         domain=table.number("domain", 0, 0, MAX_DOMAIN),
-        queue=table.number("queue", 64, 1, MAX_QUEUE),
+        queue=table.number("queue", 64 if rule.delivery is Delivery.RELIABLE else 1, 1, MAX_QUEUE),
     )
     table.finish()
     return route
