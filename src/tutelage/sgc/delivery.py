@@ -79,14 +79,17 @@ class Tally:
 class Delivery(ABC):
     """Takes messages as they come, gives them as the application should see them."""
 
-    def __init__(self, started: float, patience: float = PATIENCE) -> None:
+    def __init__(self, started: float, patience: float = PATIENCE, *, from_first_heard: bool = False) -> None:
         """
         Args:
             started: when the subscription began.
             patience: seconds without progress after which what is missing is given up.
+            from_first_heard: nothing before the first message of a stream that we hear was meant for us, even if the
+                stream began after the subscription: what was sent before a session was open is for others.
         """
         self.started = started
         self.patience = patience
+        self.from_first_heard = from_first_heard
         self.tally = Tally()
         self._current: dict[str, Stream] = {}
         self._past: deque[bytes] = deque(maxlen=256)  # salts of earlier starts
@@ -103,10 +106,11 @@ class Delivery(ABC):
         """What to ask for now: salts, each with the ranges of sequence numbers that are missing."""
         return []
 
-    def answered(self, salt: bytes, floor: int, now: float) -> list[Opened]:
-        """A question was answered, and the packets of the answer have been accepted.
+    def answered(self, salt: bytes, floor: int, now: float, *, in_vain: bool = False) -> list[Opened]:
+        """A question was answered, and what could be opened of the answer has been accepted.
 
         floor: the publisher has nothing below this sequence number any more; 0 if nobody answered.
+        in_vain: the answer holds packets that will never be opened, such as those for an earlier session.
         """
         return []
 
@@ -130,7 +134,7 @@ class Delivery(ABC):
             self._past.append(stream.salt)
             left = self._release_all(stream, now)
         # Begun after us: whatever came before this message was meant for us too.
-        ours = age_of(message.payload) <= now - self.started + SLACK
+        ours = not self.from_first_heard and age_of(message.payload) <= now - self.started + SLACK
         first = 1 if ours else message.sequence
         stream = self._current[message.sender] = Stream(message.sender, message.salt, first, patience=self.patience)
         return stream, left
@@ -177,10 +181,12 @@ class InOrder(Delivery):
                 asked.append((stream.salt, _gaps(stream)))
         return asked
 
-    def answered(self, salt: bytes, floor: int, now: float) -> list[Opened]:
+    def answered(self, salt: bytes, floor: int, now: float, *, in_vain: bool = False) -> list[Opened]:
         ready: list[Opened] = []
         for stream in self._current.values():
             if stream.salt == salt and stream.since is not None:
+                if in_vain and stream.next == stream.asked:
+                    floor = min(stream.held)
                 if floor > stream.next:
                     ready += self._skip(stream, floor, now)
                 if stream.next > stream.asked:

@@ -36,6 +36,14 @@ HELD_PACKETS = 256
 ASK = 0.2
 """Seconds between two greetings, session offers or questions of the same kind."""
 
+OFFER_EVERY = 600.0
+"""Seconds after which a session is replaced by a new one, long before the certificates behind it expire."""
+
+FOR_GOOD = frozenset(
+    {Reason.NO_SESSION, Reason.TOO_OLD, Reason.OLD_EPOCH, Reason.STALE, Reason.EXPIRED, Reason.REVOKED, Reason.NOT_ALLOWED}
+)
+"""Refusals that fetching a packet again does not change."""
+
 ANSWER_TIMEOUT = 1.0
 """Seconds to wait for a publisher to send what is missing."""
 
@@ -101,7 +109,11 @@ class Subscription:
         self._on_message = on_message
         started = time.monotonic()
         patience = delivery.PATIENCE if rule.max_age is None else min(delivery.PATIENCE, rule.max_age)
-        self.delivery: delivery.Delivery = delivery.Newest(started) if self._lossy else delivery.InOrder(started, patience)
+        self.delivery: delivery.Delivery = (
+            delivery.Newest(started)
+            if self._lossy
+            else delivery.InOrder(started, patience, from_first_heard=rule.authenticity == Authenticity.SESSION)
+        )
         self._assemblies: dict[bytes, frames.Assembly] = {}
         self._inbox: queues.SimpleQueue[tuple[float, bytes] | _Repair | _Answer | _Retry | None] = queues.SimpleQueue()
         self._inbox_limit = max(self._limit, 64)
@@ -109,6 +121,8 @@ class Subscription:
         self._lock = threading.Lock()
         self._held: deque[tuple[float, bytes]] = deque(maxlen=HELD_PACKETS)
         self._asked: dict[str, float] = {}
+        self._last_refusal: Reason | None = None
+        self._offer_at = float("inf")
         self._out: queues.Queue[Message | None] = queues.Queue(self._limit)
         self._closed = threading.Event()
         self._session = rule.authenticity == Authenticity.SESSION
@@ -219,7 +233,7 @@ class Subscription:
         if self._session:
             self._offer()
         while not self._closed.is_set():
-            wake = self.delivery.wake()
+            wake = self._wake()
             try:
                 item = self._inbox.get(timeout=None if wake is None else max(0.0, wake - time.monotonic()))
             except queues.Empty:
@@ -231,8 +245,12 @@ class Subscription:
                     self._deal_with(item)
                 except Exception:
                     log.exception("subscription of %s", self.alias)
-            if wake is not None or self.delivery.wake() is not None:
+            if wake is not None or self._wake() is not None:
                 self._mend()
+
+    def _wake(self) -> float | None:
+        wake = self.delivery.wake()
+        return wake if not self._session else self._offer_at if wake is None else min(wake, self._offer_at)
 
     def _deal_with(self, item: tuple[float, bytes] | _Repair | _Answer | _Retry) -> None:
         if isinstance(item, tuple):
@@ -243,12 +261,14 @@ class Subscription:
             else:
                 self._pass_on(self._take(*item))
         elif isinstance(item, _Repair):
-            received = time.time()
+            received, refused = time.time(), 0
             for late in item.packets:
                 before = self.packets
                 self._pass_on(self._take(received, late))
                 self.repaired += self.packets > before
-            self._pass_on(self._messages(self.delivery.answered(item.salt, item.floor, time.monotonic()), received))
+                refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
+            ready = self.delivery.answered(item.salt, item.floor, time.monotonic(), in_vain=refused > 0)
+            self._pass_on(self._messages(ready, received))
         elif isinstance(item, _Answer):
             try:
                 self.opener.complete_session(item.packet)
@@ -284,6 +304,7 @@ class Subscription:
             self._inbox.put(_Retry())  # those that waited for the introduction of this sender
 
     def _refused(self, reason: Reason, received: float, packet: bytes | memoryview) -> None:
+        self._last_refusal = reason
         if reason == Reason.UNKNOWN_EPOCH:
             self._held.append((received, bytes(packet)))
             self._need_key()
@@ -295,6 +316,7 @@ class Subscription:
             self._offer()
 
     def _offer(self) -> None:
+        self._offer_at = time.monotonic() + OFFER_EVERY
         try:
             self._transport.publish(lanes.key(self._entry.name, lanes.OFFER), self.opener.offer_session())
         except Refused:
@@ -334,6 +356,8 @@ class Subscription:
     def _mend(self) -> None:
         """What time brings: gaps that are asked for, and gaps that are given up."""
         now = time.monotonic()
+        if now >= self._offer_at:
+            self._offer()
         self._pass_on(self._messages(self.delivery.due(now), time.time()))
         for salt, ranges in self.delivery.questions(now):
             self._pool.submit(self._ask, salt, ranges)
