@@ -10,7 +10,6 @@ import logging
 import threading
 import uuid
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from tutelage.errors import MissingExtraError
@@ -34,22 +33,6 @@ def parse_user_data(data: bytes) -> dict[str, str]:
     """The other way round; what is not of that form is left out."""
     pairs = (part.partition("=") for part in data.decode("utf-8", "replace").split(";"))
     return {key: value for key, equals, value in pairs if equals}
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A writer or reader of somebody else, as discovery shows it.
-
-    Attributes:
-        topic, type: as DDS calls them.
-        writes: a writer; otherwise a reader.
-        proxy: mark of the proxy that it belongs to, "" if none.
-    """
-
-    topic: str
-    type: str
-    writes: bool
-    proxy: str
 
 
 class Reader:

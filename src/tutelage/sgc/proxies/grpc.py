@@ -1,7 +1,7 @@
 """A gRPC gateway to the fleet's topics and services, for programs in any language; tutelage.proto says what it offers.
 
-On loopback by default, or on a Unix socket. The nodes' own certificates (Ed25519) cannot be used for its TLS, as gRPC's
-library does not accept such keys. So it takes certificates of your own, and clients prove themselves by certificate or token.
+On loopback by default, or on a Unix socket. The nodes' own certificates (Ed25519) cannot be used for its TLS: gRPC's library
+does not accept such keys. It takes certificates of your own, and clients prove themselves by certificate or token.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 from tutelage.errors import ConfigError, MissingExtraError
-from tutelage.sgc.proxies.listen import Tls, check_listen, has_token
+from tutelage.sgc.proxies.listen import Tls, check_listen, has_token, parse_address
 
 if TYPE_CHECKING:
     from tutelage.sgc.node import Node
@@ -44,10 +44,7 @@ class Gateway:
         except ImportError:
             raise MissingExtraError("grpcio", "grpc") from None
         if not listen.startswith("unix:"):
-            host, colon, port = listen.rpartition(":")
-            if not colon or not port.isdigit():
-                raise ConfigError(f"{listen!r} is no address; use host:port or unix:path")
-            check_listen("a gRPC gateway", host, token, tls)
+            check_listen("a gRPC gateway", parse_address(listen)[0], token, tls)
         self._listen, self._token, self._tls = listen, token, tls
         self._server: grpc.aio.Server | None = None
         self._calls: Calls | None = None
@@ -62,9 +59,9 @@ class Gateway:
             self._end_loop()
             raise
 
-    def counters(self) -> dict[str, dict[str, int]]:
+    def counters(self) -> dict[str, Any]:
         """What was counted."""
-        return {"grpc": self._calls.counts.as_dict()} if self._calls is not None else {}
+        return dict(self._calls.counts.as_dict()) if self._calls is not None else {}
 
     def close(self) -> None:
         """End all calls and stop."""

@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeout
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import grpc
@@ -16,6 +17,7 @@ from tutelage.sgc.access import Delivery, Kind, Lane
 from tutelage.sgc.errors import NoKey, NotAllowed
 from tutelage.sgc.proxies.counts import Counts
 from tutelage.sgc.proxies.grpc_messages import messages
+from tutelage.sgc.proxies.latched import Newcomer
 from tutelage.sgc.proxies.queues import LoopQueue
 from tutelage.sgc.transport.base import Congested, NoReply
 
@@ -92,13 +94,16 @@ class Calls:
                 raise ConfigError(f"a queue holds {MAX_QUEUE} messages at most, not {request.queue}")
             queue: LoopQueue[Message] = LoopQueue(request.queue or DEFAULT_QUEUE, self._loop)
             reliable = self._node.access.entry(request.topic).rule.delivery is Delivery.RELIABLE
+            newcomer = Newcomer()
             over = False
 
             def on_message(message: Message) -> None:
-                if not reliable:
-                    queue.put(message)
-                while reliable and not over and not queue.offer(message, 0.2):
-                    pass  # the node holds back meanwhile, and fetches later what it cannot hold
+                for payload in newcomer.accept(message.sender, bytes(message.payload)):
+                    each = replace(message, payload=payload)
+                    if not reliable:
+                        queue.put(each)
+                    while reliable and not over and not queue.offer(each, 0.2):
+                        pass  # the node holds back meanwhile, and fetches later what it cannot hold
 
             subscription = self._node.subscribe(request.topic, on_message, queue=request.queue or None)
             # The client knows from these headers that it will miss nothing from here on.

@@ -1,6 +1,6 @@
 """The messages of tutelage.proto, from its compiled descriptor.
 
-Code that protoc generates for Python is tied to a range of protobuf versions; the descriptor is not. It is compiled, here, by
+Code that protoc generates for Python is tied to a range of protobuf versions; the descriptor is not. It is compiled here by
 
     python -m grpc_tools.protoc -I. --descriptor_set_out=tutelage.binpb tutelage.proto
 

@@ -31,10 +31,22 @@ class Tls:
             raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
 
 
+def parse_address(address: str) -> tuple[str, int]:
+    """HOST:PORT, also [IPv6]:PORT.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    host, colon, port = address.rpartition(":")
+    if not host or not colon or not port.isdigit() or int(port) > 65535:
+        raise ConfigError(f"{address!r} is no address; write HOST:PORT, such as 127.0.0.1:9090")
+    return host.strip("[]"), int(port)
+
+
 def is_loopback(host: str) -> bool:
     """Is this an address that only this machine can reach?"""
     try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
+        return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 

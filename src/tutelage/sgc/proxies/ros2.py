@@ -14,10 +14,12 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from tutelage.errors import TutelageError
 from tutelage.sgc.errors import NoKey
 from tutelage.sgc.proxies import dds_raw
 from tutelage.sgc.proxies.counts import Counts
 from tutelage.sgc.proxies.dds_domain import Domain, Writer
+from tutelage.sgc.proxies.latched import Newcomer, Retained
 from tutelage.sgc.proxies.queues import BoundedQueue
 from tutelage.sgc.proxies.ros_hash import TypeHashes
 from tutelage.sgc.proxies.ros_names import topic_channel
@@ -48,34 +50,39 @@ class Ros2Proxy:
     """
 
     def __init__(self, node: Node, routes: Routes) -> None:
+        self._node = node
         self._domains: dict[int, Domain] = {}
+        self._closed = threading.Event()
         self._parts: list[Outward | Inward | Client | Server] = []
         hashes = TypeHashes(routes.distribution)
         try:
             inward = [self._add(Inward(node, self._domain(r.domain), r, hashes)) for r in routes.topics if r.inward]
             for route in routes.topics:
                 if route.outward:
-                    # The node does not hear itself: what goes out also goes to this proxy's other domains.
+                    # What this node sends it does not take in; so what goes out also goes to this proxy's other domains.
                     others = [i for i in inward if i.route.alias == route.alias and i.route.domain != route.domain]
                     self._add(Outward(node, self._domain(route.domain), route, hashes, [other.write for other in others]))
             for service in routes.services:
                 kind = Server if service.outward else Client
                 self._add(kind(node, self._domain(service.domain), service))
+            if any(isinstance(part, Outward) and part.retained for part in self._parts):
+                threading.Thread(target=self._tend, name="ros2-latched", daemon=True).start()
         except BaseException:
             self.close()
             raise
 
-    def counters(self) -> dict[str, dict[str, int]]:
-        """What was carried and what was not, by alias (and, beyond its first route, name and domain)."""
-        result: dict[str, dict[str, int]] = {}
+    def counters(self) -> dict[str, Any]:
+        """What was carried and what was not: topics/<alias>/..., of all routes of the alias together."""
+        topics: dict[str, dict[str, int]] = {}
         for part in self._parts:
-            counts = result.setdefault(part.route.alias, {})
+            counts = topics.setdefault(part.route.alias, {})
             for name, count in part.counters().items():
                 counts[name] = counts.get(name, 0) + count
-        return result
+        return {"topics": topics}
 
     def close(self) -> None:
         """Leave the domains; the node stays."""
+        self._closed.set()
         for part in self._parts:
             part.close()
         for domain in self._domains.values():
@@ -88,6 +95,18 @@ class Ros2Proxy:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _tend(self) -> None:
+        """Latched topics: see who has arrived."""
+        while not self._closed.wait(0.5):
+            try:
+                peers = self._node.peers()
+            except TutelageError as error:
+                log.warning("who is there cannot be told now: %s", error)
+                continue
+            for part in self._parts:
+                if isinstance(part, Outward) and part.retained is not None:
+                    part.retained.tend(frozenset(peer.name for peer in peers if part.route.alias in peer.topics))
 
     def _domain(self, number: int) -> Domain:
         if number not in self._domains:
@@ -118,6 +137,8 @@ class Outward:
         self._keep_all = route.qos.history == "keep_all"
         self._counts = Counts("out", "congested", "without_key")
         self._closed = False
+        latched = route.qos.durability == "transient_local"
+        self.retained = Retained(route.qos.depth, self._send) if latched else None
         self._thread = threading.Thread(target=self._run, name=f"ros2-out-{route.alias}", daemon=True)
         self._thread.start()
         channel = topic_channel(route.name, route.type)
@@ -141,7 +162,10 @@ class Outward:
                 self._domain.wake()
             for other in self._others:
                 other(data)
-            self._send(data)
+            if self.retained is not None:
+                self.retained.send(data)
+            else:
+                self._send(data)
 
     def _send(self, data: bytes) -> None:
         until = time.monotonic() + _GIVE_UP
@@ -166,6 +190,7 @@ class Inward:
     def __init__(self, node: Node, domain: Domain, route: TopicRoute, hashes: TypeHashes) -> None:
         self.route = route
         self._name = node.name
+        self._newcomer = Newcomer(route.qos.depth if route.qos.durability == "transient_local" else 0)
         self._counts = Counts("in", "not_cdr", "in_dropped")
         channel = topic_channel(route.name, route.type)
         self._writer: Writer = domain.writer(channel, route.qos, hashes.pairs(route.type))
@@ -192,4 +217,5 @@ class Inward:
 
     def _on_message(self, message: Message) -> None:
         if message.sender != self._name:
-            self.write(bytes(message.payload))
+            for data in self._newcomer.accept(message.sender, bytes(message.payload)):
+                self.write(data)

@@ -93,11 +93,11 @@ class Bridge:
         host, port = self._server.sockets[0].getsockname()[:2]
         return host, port
 
-    def counters(self) -> dict[str, dict[str, int]]:
-        """What was counted: for the bridge, and by alias."""
+    def counters(self) -> dict[str, Any]:
+        """What was counted: for the bridge, and topics/<alias>/..."""
         topics = {t.route.alias: t.counts.as_dict(dropped=t.dropped) for t in self.topics.values()}
         services = {s.route.alias: s.counts.as_dict() for s in self.services.values()}
-        return {"rosbridge": self.counts.as_dict(connected=self._clients), **topics, **services}
+        return {**self.counts.as_dict(connected=self._clients), "topics": {**topics, **services}}
 
     def close(self) -> None:
         """Disconnect everybody and stop."""
@@ -130,6 +130,8 @@ class Bridge:
             )
         except OSError as error:
             raise ConfigError(f"cannot listen on {host}:{port}: {error.strerror}") from None
+        for topic in self.topics.values():
+            topic.start()
 
     def _admit(self, connection: Any, request: Any) -> Any:
         """None: come in; otherwise the refusal."""

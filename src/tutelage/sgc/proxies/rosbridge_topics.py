@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tutelage.sgc.access import Delivery
 from tutelage.sgc.proxies.counts import Counts
+from tutelage.sgc.proxies.latched import Newcomer
 from tutelage.sgc.proxies.queues import LoopQueue
 from tutelage.sgc.proxies.ros_types import RosTypes
 from tutelage.sgc.proxies.ros_values import Codec
@@ -106,6 +108,8 @@ class Topic:
         self.counts = Counts("published", "received", "unreadable")
         self._node, self._codecs, self._loop = node, codecs, loop
         self._listeners: list[Listener] = []
+        self._newcomer = Newcomer()
+        self._latched: deque[Outgoing] = deque(maxlen=route.qos.depth)
         self._queue: LoopQueue[tuple[bytes, float]] = LoopQueue(route.queue, loop)
         # While we wait, the node holds back, and fetches again what it could not hold; lossy topics move on.
         reliable = node.access.entry(route.alias).rule.delivery is Delivery.RELIABLE
@@ -128,22 +132,32 @@ class Topic:
         """Messages that came faster than they could be converted."""
         return self._queue.dropped
 
+    @property
+    def is_latched(self) -> bool:
+        """Does a late subscription get the last messages? Then they are fetched even while nobody listens."""
+        return self.route.inward and self.route.qos.durability == "transient_local"
+
+    def start(self) -> None:
+        """Fetch a latched topic. On the event loop."""
+        if self.is_latched:
+            self._open()
+
     def add(self, listener: Listener) -> None:
         """Let a subscription hear what comes; the first one subscribes to the fleet's topic.
 
         Raises:
             NotAllowed: the policy does not let this node subscribe.
         """
-        if self._subscription is None:
-            self._subscription = self._node.subscribe(self.route.alias, self._on_message, queue=self.route.queue)
-            self._task = self._loop.create_task(self._deliver())
+        self._open()
+        for outgoing in self._latched:
+            listener.offer(outgoing)
         self._listeners.append(listener)
 
     def remove(self, listener: Listener) -> Callable[[], None] | None:
         """Let it hear no more. If it was the last one: what ends the subscription; it may block, so not on the loop."""
         if listener in self._listeners:
             self._listeners.remove(listener)
-        if self._listeners or self._subscription is None:
+        if self._listeners or self._subscription is None or self.is_latched:
             return None
         close, self._subscription = self._subscription.close, None
         if self._task is not None:
@@ -151,7 +165,7 @@ class Topic:
         return close
 
     async def publish(self, data: bytes) -> None:
-        """Send a message to the fleet and, as the node does not hear itself, to the clients here.
+        """Send a message to the fleet and, without that way round, to the clients here.
 
         Raises:
             NotAllowed, Congested, NoKey: see `Publisher.send`; Congested after some time of trying.
@@ -181,15 +195,24 @@ class Topic:
         if self._subscription is not None:
             await asyncio.to_thread(self._subscription.close)
 
+    def _open(self) -> None:
+        if self._subscription is None:
+            self._newcomer = Newcomer()
+            self._subscription = self._node.subscribe(self.route.alias, self._on_message, queue=self.route.queue)
+            self._task = self._loop.create_task(self._deliver())
+
     def _on_message(self, message: Message) -> None:
         if message.sender != self._node.name:
-            self._queue.put((bytes(message.payload), message.received), self._patience)
+            for data in self._newcomer.accept(message.sender, bytes(message.payload)):
+                self._queue.put((data, message.received), self._patience)
 
     async def _deliver(self) -> None:
         while True:
             data, received = await self._queue.get()
             self.counts.add("received")
             outgoing = Outgoing(self, data, received)
+            if self.is_latched:
+                self._latched.append(outgoing)
             for listener in tuple(self._listeners):
                 listener.offer(outgoing)
             await asyncio.sleep(0)  # a fast topic leaves room for the others

@@ -17,7 +17,7 @@ alias = "grasp"
 direction = "in"                  # out: the server is here; in: the clients are here
 timeout = 5.0                     # seconds
 
-[[action]]                        # its parts: aliases fold.send_goal, .cancel_goal, .get_result, .feedback, .status
+[[action]]                        # its parts: fold-send_goal, -cancel_goal, -get_result, -feedback, -status
 alias = "fold"
 name = "/fold"
 type = "example_interfaces/action/Fibonacci"
@@ -202,13 +202,16 @@ def _topic(table: _Table, access: Access) -> TopicRoute:
                 f"{table.what}: direction {direction}, but the policy does not let {access.node} {verb} it; "
                 f"change the direction, or the policy of {access.fleet}"
             )
+    qos = table.qos("default")
+    if qos.durability == "transient_local" and rule.delivery is not Delivery.RELIABLE:
+        raise ConfigError(f"{table.what}: a transient_local topic must be reliable in the policy, not {rule.delivery}")
     route = TopicRoute(
         alias=alias,
         name=_name(table, rule.topic.interface),
         type=_type(table, rule.topic.type, "msg"),
         outward=direction in ("out", "both"),
         inward=direction in ("in", "both"),
-        qos=table.qos("default"),
+        qos=qos,
         domain=table.number("domain", 0, 0, MAX_DOMAIN),
         queue=table.number("queue", 64 if rule.delivery is Delivery.RELIABLE else 1, 1, MAX_QUEUE),
     )
@@ -268,7 +271,7 @@ def _action(table: _Table, access: Access) -> tuple[list[TopicRoute], list[Servi
     common = {"direction": direction, "domain": domain}
 
     def part(suffix: str, kind: str, **settings: Any) -> _Table:
-        given = {"alias": f"{alias}.{suffix}", "name": f"{name}/_action/{suffix}", **common, **settings}
+        given = {"alias": f"{alias}-{suffix}", "name": f"{name}/_action/{suffix}", **common, **settings}
         return _Table(given, kind)
 
     services = [
