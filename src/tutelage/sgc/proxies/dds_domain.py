@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 MARK = "tutelage"
 """Key in the USER_DATA of what a proxy writes. No proxy takes what a proxy has written, so nothing goes round in circles."""
 _NO_TIME = 2**63 - 1  # DDS's infinity, nanoseconds
+_AT_ONCE = 16
 _WRITE_TIMEOUT = 100_000_000  # nanoseconds that a reliable writer may wait for slow readers
 
 
@@ -65,8 +66,8 @@ class Reader:
 
     def drain(self) -> None:
         """Take all that is there, as long as it is wanted."""
-        while self._deliver.ready():
-            samples = dds_raw.take(self.dds)
+        while room := self._deliver.room():
+            samples = dds_raw.take(self.dds, min(room, _AT_ONCE))
             for sample in samples:
                 if self._from_proxy(sample.writer):
                     self.ignored += 1
@@ -83,7 +84,7 @@ class Reader:
     @property
     def ready(self) -> bool:
         """Is there room for more?"""
-        return self._deliver.ready()
+        return self._deliver.room() > 0
 
     def _from_proxy(self, writer: int) -> bool:
         known = self._proxies.get(writer)
@@ -104,10 +105,10 @@ class Reader:
 
 
 class _Deliver:
-    """What a reader's samples go to: `put` each; `ready` says whether it has room."""
+    """What a reader's samples go to: `put` each; `room` says how many more it takes now."""
 
-    def __init__(self, put: Callable[[bytes], None], ready: Callable[[], bool]) -> None:
-        self.put, self.ready = put, ready
+    def __init__(self, put: Callable[[bytes], None], room: Callable[[], int]) -> None:
+        self.put, self.room = put, room
 
 
 class Writer:
@@ -169,15 +170,15 @@ class Domain:
         qos: QosProfile,
         put: Callable[[bytes], None],
         *,
-        ready: Callable[[], bool] = lambda: True,
+        room: Callable[[], int] = lambda: _AT_ONCE,
         pairs: dict[str, str] | None = None,
     ) -> Reader:
         """Read a topic: `put` gets each sample that no proxy has written, on the domain's thread, so it must not block.
 
-        ready: while it is false, samples stay with DDS; `wake` tells that it has become true.
+        room: for how many samples there is room; others stay with DDS. `wake` tells that there is room again.
         pairs: for USER_DATA.
         """
-        reader = Reader(self, channel, qos, pairs or {}, _Deliver(put, ready))
+        reader = Reader(self, channel, qos, pairs or {}, _Deliver(put, room))
         with self._lock:
             self._readers.append(reader)
         self.wake()

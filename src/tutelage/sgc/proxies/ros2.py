@@ -12,6 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from tutelage.errors import TutelageError
@@ -143,8 +144,9 @@ class Outward:
         self._thread.start()
         channel = topic_channel(route.name, route.type)
         # A writer that keeps all waits for its readers; so with KEEP_ALL samples stay with DDS while the queue is full.
-        ready = (lambda: not self._queue.full) if self._keep_all else (lambda: True)
-        self._reader = domain.reader(channel, route.qos, self._queue.put, ready=ready, pairs=hashes.pairs(route.type))
+        room = {"room": lambda: self._queue.room} if self._keep_all else {}
+        qos = replace(route.qos, depth=max(route.qos.depth, route.queue))
+        self._reader = domain.reader(channel, qos, self._queue.put, pairs=hashes.pairs(route.type), **room)
 
     def counters(self) -> dict[str, int]:
         """Messages sent, and dropped by reason."""

@@ -25,6 +25,7 @@ type = "example_interfaces/action/Fibonacci"
 
 from __future__ import annotations
 
+import logging
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ from tutelage.sgc.access import Access, Delivery, Kind, Lane
 from tutelage.sgc.proxies.ros_names import full_name, full_type
 from tutelage.sgc.proxies.ros_qos import PROFILES, QosProfile, parse_qos
 
+log = logging.getLogger(__name__)
 MAX_DOMAIN = 232
 """The highest DDS domain for which there are UDP ports."""
 MAX_QUEUE = 100_000
@@ -132,16 +134,19 @@ def parse_routes(content: Mapping[str, Any], access: Access) -> Routes:
 def all_routes(access: Access) -> Routes:
     """Everything that the policy gives this node a part in, under the policy's own names.
 
-    Raises:
-        ConfigError: the policy's interface or type is none that ROS 2 knows; name it in a file of routes instead.
+    Topics whose interface or type ROS 2 does not know are left out, with a warning; a file of routes can name them.
     """
-    entries = [{"alias": alias} for alias, entry in access.topics.items() if entry.rule.kind is Kind.STREAM]
-    services = [
-        {"alias": alias, "direction": "out" if entry.rule.may_receive(access.node, Lane.REQUEST) else "in"}
-        for alias, entry in access.topics.items()
-        if entry.rule.kind is Kind.SERVICE
-    ]
-    return parse_routes({"version": 1, "topic": entries, "service": services}, access)
+    topics, services = [], []
+    for alias, entry in access.topics.items():
+        try:
+            if entry.rule.kind is Kind.STREAM:
+                topics.append(_topic(_Table({"alias": alias}, "a topic"), access))
+            else:
+                direction = "out" if entry.rule.may_receive(access.node, Lane.REQUEST) else "in"
+                services.append(_service(_Table({"alias": alias, "direction": direction}, "a service"), access))
+        except ConfigError as error:
+            log.warning("left out: %s", error)
+    return Routes(tuple(topics), tuple(services))
 
 
 class _Table:
