@@ -23,7 +23,7 @@ CYCLONE = """
   </Discovery>
 </Domain></CycloneDDS>"""
 os.environ["CYCLONEDDS_URI"] = CYCLONE.format(tag=f"<Tag>{os.getpid()}</Tag>")
-_domains = itertools.cycle(range(1, 100))
+_domains = itertools.cycle(range(1, 80))
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Company:
 
 @pytest.fixture
 def domains() -> Iterator[int]:
-    """DDS domains that no other test has at the same time: `next(domains)`."""
+    """DDS domains that no other test has at the same time: `next(domains)`. From 80 on they are for Fast DDS."""
     return _domains
 
 
