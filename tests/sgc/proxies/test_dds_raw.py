@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
+from sgc.proxies.ros_ends import RELIABLE, STRING, RosNode, String, cdr, taken, until
 
-from sgc.proxies.ros_ends import RELIABLE, STRING, RosNode, String, cdr, taken, until  # isort: skip
 from tutelage.sgc.proxies import dds_raw
 from tutelage.sgc.proxies.ros_names import topic_channel
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 from sgc.fleets import topic
+from sgc.proxies.conftest import CYCLONE
+from sgc.proxies.ros_ends import RosNode, taken, until
+from sgc.proxies.test_ros2 import BOTH, chat, proxy
 
-from sgc.proxies.conftest import CYCLONE  # isort: skip
-from sgc.proxies.ros_ends import RosNode, taken, until  # isort: skip
-from sgc.proxies.test_ros2 import BOTH, chat, proxy  # isort: skip
 from tutelage.sgc.proxies.ros2 import Inward
 
 SOURCE = Path(__file__).parent / "fastdds" / "chatter.cpp"

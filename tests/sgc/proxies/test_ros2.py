@@ -9,8 +9,7 @@ import pytest
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import Policy
 from sgc.fleets import topic
-
-from sgc.proxies.ros_ends import (  # isort: skip
+from sgc.proxies.ros_ends import (
     BEST_EFFORT,
     IMAGE,
     LATCHED,
@@ -21,6 +20,7 @@ from sgc.proxies.ros_ends import (  # isort: skip
     taken,
     until,
 )
+
 from tutelage.sgc.proxies import dds_raw
 from tutelage.sgc.proxies.dds_domain import parse_user_data
 from tutelage.sgc.proxies.ros2 import Ros2Proxy

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 from sgc.fleets import Fleet, free_port, service, topic
+from sgc.proxies.ros_ends import ADD, STRING, AddClient, AddServer, RosNode, taken, until
+from sgc.proxies.test_ros2 import DEEP
 
-pytest.importorskip("zenoh")
-from sgc.proxies.ros_ends import ADD, STRING, AddClient, AddServer, RosNode, taken, until  # isort: skip
-from sgc.proxies.test_ros2 import DEEP  # isort: skip
 from tutelage.sgc.node import Node
 from tutelage.sgc.proxies.ros2 import Ros2Proxy
 from tutelage.sgc.proxies.routes import Routes, ServiceRoute, TopicRoute

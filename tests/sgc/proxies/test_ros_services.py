@@ -9,8 +9,8 @@ import pytest
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from sgc.fleets import service, topic
+from sgc.proxies.ros_ends import ADD, RELIABLE, AddClient, AddServer, RosNode, cdr, until
 
-from sgc.proxies.ros_ends import ADD, RELIABLE, AddClient, AddServer, RosNode, cdr, until  # isort: skip
 from tutelage.sgc.proxies import dds_raw
 from tutelage.sgc.proxies.ros2 import Ros2Proxy
 from tutelage.sgc.proxies.ros_names import service_channels

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sgc.proxies.ros_ends import STORE, STRING, cdr
 
-from sgc.proxies.ros_ends import STORE, STRING, cdr  # isort: skip
 from tutelage.errors import ConfigError
 from tutelage.sgc.proxies.ros_input import BadValue
 from tutelage.sgc.proxies.ros_types import RosTypes

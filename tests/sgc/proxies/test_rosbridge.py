@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import socket
 import threading
 import time
 from contextlib import contextmanager
@@ -12,11 +13,11 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from sgc.fleets import Fleet, service, topic
+from sgc.proxies.conftest import Company
+from sgc.proxies.ros_ends import ADD, STRING, cdr, until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from sgc.proxies.conftest import Company  # isort: skip
-from sgc.proxies.ros_ends import ADD, STRING, cdr, until  # isort: skip
 from tutelage.errors import ConfigError
 from tutelage.sgc.proxies.ros_types import RosTypes
 from tutelage.sgc.proxies.rosbridge import Bridge
@@ -419,7 +420,10 @@ def test_a_client_that_does_not_read_costs_bounded_memory_and_nobody_elses_messa
 
 
 def test_a_client_that_asks_and_never_reads_is_disconnected(bridge):
-    page = Page(bridge.address, max_queue=1, ping_interval=None)
+    narrow = socket.socket()
+    narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    narrow.connect(bridge.address)
+    page = Page(bridge.address, max_queue=1, ping_interval=None, sock=narrow)
 
     def ask():
         with contextlib.suppress(ConnectionClosed):
@@ -428,7 +432,7 @@ def test_a_client_that_asks_and_never_reads_is_disconnected(bridge):
 
     asking = threading.Thread(target=ask)
     asking.start()
-    assert until(lambda: bridge.counts.as_dict()["too_slow"] == 1)
+    assert until(lambda: bridge.counts.as_dict()["too_slow"] == 1, 30.0)
     assert until(lambda: bridge.counters()["connected"] == 0)
     page.socket.socket.close()
     asking.join(10.0)

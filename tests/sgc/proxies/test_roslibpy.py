@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import roslibpy
 from sgc.fleets import service, topic
+from sgc.proxies.ros_ends import ADD, until
 
-roslibpy = pytest.importorskip("roslibpy")
-from sgc.proxies.ros_ends import ADD, until  # isort: skip
 from tutelage.sgc.proxies.ros_types import RosTypes
 from tutelage.sgc.proxies.rosbridge import Bridge
 from tutelage.sgc.proxies.routes import all_routes
