@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from sgc.fleets import topic
-from sgc.proxies.conftest import CYCLONE
+from sgc.proxies.company import CYCLONE
 from sgc.proxies.ros_ends import RosNode, taken, until
 from sgc.proxies.test_ros2 import BOTH, chat, proxy
 

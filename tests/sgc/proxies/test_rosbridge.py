@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from sgc.fleets import Fleet, service, topic
-from sgc.proxies.conftest import Company
+from sgc.proxies.company import Company
 from sgc.proxies.ros_ends import ADD, STRING, cdr, until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
