@@ -17,7 +17,7 @@ from sgc.proxies.company import CYCLONE
 from sgc.proxies.ros_ends import RosNode, taken, until
 from sgc.proxies.test_ros2 import BOTH, chat, proxy
 
-from tutelage.sgc.proxies.ros2 import Inward
+from tutelage.sgc.proxies.ros_topics import Inward
 
 SOURCE = Path(__file__).parent / "fastdds" / "chatter.cpp"
 HEADERS = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")

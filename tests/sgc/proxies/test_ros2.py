@@ -21,8 +21,9 @@ from sgc.proxies.ros_ends import (
     until,
 )
 
+from tutelage.errors import ConfigError
 from tutelage.sgc.proxies import dds_raw
-from tutelage.sgc.proxies.dds_domain import parse_user_data
+from tutelage.sgc.proxies.dds_qos import parse_user_data
 from tutelage.sgc.proxies.ros2 import Ros2Proxy
 from tutelage.sgc.proxies.ros_qos import PROFILES
 from tutelage.sgc.proxies.routes import Routes, TopicRoute
@@ -173,6 +174,17 @@ def test_best_effort_and_lossy_topics_flow(company, domains):
         assert not reliable.get_matched_publications(), "best effort is offered, so reliable is refused"
 
 
+def test_qualities_of_service_that_do_not_fit_are_told(company, domains, caplog):
+    here = next(domains)
+    robot, _ = company(CHAT, "robot", "server")
+    with proxy(robot, chat(here, **OUT)):
+        node = RosNode(here)
+        writer = node.publisher("/chatter", qos=BEST_EFFORT)
+        assert until(lambda: "/chatter on domain" in caplog.text)
+        assert "do not fit the route's qos (reliability)" in caplog.text
+        assert not writer.get_matched_subscriptions()
+
+
 def test_a_queue_that_overflows_drops_the_oldest_and_counts_them(company, domains):
     here = next(domains)
     robot, _ = company(CHAT, "robot", "server")
@@ -248,6 +260,13 @@ def test_type_hashes_and_marks_are_in_discovery_for_distributions_that_have_them
             # The hash that `ros2 topic info -v` shows for std_msgs/msg/String.
             expected = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
             assert data.get("typehash") == (expected if hashed else None)
+
+
+def test_a_domain_that_cannot_be_joined_is_one_line(company, domains, monkeypatch):
+    robot, _ = company(CHAT, "robot", "server")
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>")
+    with pytest.raises(ConfigError, match="cannot be joined"):
+        proxy(robot, chat(next(domains)))
 
 
 def test_a_closed_proxy_leaves_its_domains(company, domains):
