@@ -62,7 +62,8 @@ class Access:
         secret: 32 bytes that all nodes of the fleet know and no router does; hides names of nodes on the control channel.
             Empty for routers.
         routes: for routers only.
-        members: for routers only: pseudonyms of all members that are not revoked.
+        members: for routers only: pseudonyms of all nodes that are not revoked.
+        routers: for routers only: pseudonyms of all routers that are not revoked.
     """
 
     fleet: str
@@ -73,6 +74,7 @@ class Access:
     secret: bytes = field(default=b"", repr=False)
     routes: tuple[Route, ...] = ()
     members: frozenset[str] = frozenset()
+    routers: frozenset[str] = frozenset()
 
     def entry(self, alias: str) -> Entry:
         """The topic of an alias.
@@ -126,6 +128,7 @@ class Access:
                 for route in self.routes
             ],
             "members": sorted(self.members),
+            "routers": sorted(self.routers),
         }
         return json.dumps(content, sort_keys=True, separators=(",", ":"))
 
@@ -155,6 +158,7 @@ class Access:
                 secret=bytes.fromhex(content["secret"]),
                 routes=routes,
                 members=frozenset(content["members"]),
+                routers=frozenset(content["routers"]),
             )
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, ConfigError) as error:
             raise Refused(Reason.MALFORMED, f"not a part of a policy: {error}") from None

@@ -254,7 +254,8 @@ class Authority:
             control=Name.of_channel("notices", control),
             secret=b"" if router else control,
             routes=routes(entries.values(), nodes) if router else (),
-            members=frozenset(pseudonyms.values()) if router else frozenset(),
+            members=frozenset(nodes.values()) if router else frozenset(),
+            routers=frozenset(pseudonyms.values()) - frozenset(nodes.values()) if router else frozenset(),
         )
 
     def _topic_secret(self, canonical: bytes) -> bytes:

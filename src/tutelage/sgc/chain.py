@@ -32,6 +32,8 @@ _ENTRY = struct.Struct(">Q32s")
 _SIGNATURE = 64
 _MAX_ENTRIES = 2 * EVERY
 _MAX_STREAMS = 64
+MAX_CONFIRMED = 8192
+"""Digests kept a stream, for messages that are fetched again after their anchors came."""
 
 _V = TypeVar("_V")
 _NOTHING: dict[int, bytes] = {}
@@ -147,7 +149,7 @@ class Confirmation:
                 except Refused as refused:
                     self._refusals.add(refused.reason, len(held[0]))
             confirmed[first] = expected
-        while len(confirmed) > 2 * _MAX_ENTRIES:
+        while len(confirmed) > MAX_CONFIRMED:
             confirmed.popitem(last=False)
         self._drop_forged(stream, confirmed)
         return found

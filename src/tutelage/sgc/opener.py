@@ -69,7 +69,7 @@ class Opener:
         self.refusals = Refusals()
         self._keyring, self._home = keyring, keyring.home
         self._entry = self._home.access.check(alias, lane, sends=False)
-        self._authenticity = self._entry.rule.authenticity
+        self._authenticity = self._entry.rule.authenticity_on(lane)
         self._mode = MODES[self._authenticity]
         self._name = bytes(self._entry.name)
         self._provisional = provisional
@@ -278,7 +278,7 @@ class Opener:
         self._epochs.clear()
         if versions[1] != self._versions[1]:
             self._entry = self._home.access.check(self.alias, self.lane, sends=False)
-            if self._entry.name != self._name or self._entry.rule.authenticity != self._authenticity:
+            if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
                 raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
         self._versions, self._looked = versions, now
 

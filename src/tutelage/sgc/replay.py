@@ -11,7 +11,8 @@ from collections import OrderedDict
 
 from tutelage.sgc.reasons import Reason, Refused
 
-WINDOW = 4096
+WINDOW = 1 << 17
+"""Messages: what is fetched again after a gap lies far behind the newest, 2.5 seconds of a fast topic or more."""
 MAX_SALTS = 8
 MAX_SENDERS = 1024
 TOLERANCE_NS = 5_000_000_000

@@ -43,6 +43,7 @@ class Lane(StrEnum):
     STREAM = "stream"
     REQUEST = "request"
     REPLY = "reply"
+    PRESENCE = "presence"  # members to members: who is there, and how far away; always signed
 
 
 class Role(StrEnum):
@@ -91,10 +92,14 @@ class TopicRule:
 
     def may_send(self, node: str, lane: Lane = Lane.STREAM) -> bool:
         """May this node send on this lane?"""
+        if lane == Lane.PRESENCE:
+            return self.is_member(node)
         return _any(node, {Lane.STREAM: self.publish, Lane.REQUEST: self.request, Lane.REPLY: self.serve}[lane])
 
     def may_receive(self, node: str, lane: Lane = Lane.STREAM) -> bool:
         """May this node receive on this lane?"""
+        if lane == Lane.PRESENCE:
+            return self.is_member(node)
         return _any(node, {Lane.STREAM: self.subscribe, Lane.REQUEST: self.serve, Lane.REPLY: self.request}[lane])
 
     def is_member(self, node: str) -> bool:
@@ -102,8 +107,12 @@ class TopicRule:
         return node == self.owner or any(_any(node, getattr(self, who)) for who in _WHO)
 
     def lanes(self) -> tuple[Lane, ...]:
-        """STREAM for a stream, REQUEST and REPLY for a service."""
-        return (Lane.STREAM,) if self.kind == Kind.STREAM else (Lane.REQUEST, Lane.REPLY)
+        """STREAM for a stream, REQUEST and REPLY for a service; PRESENCE for both."""
+        return (*((Lane.STREAM,) if self.kind == Kind.STREAM else (Lane.REQUEST, Lane.REPLY)), Lane.PRESENCE)
+
+    def authenticity_on(self, lane: Lane) -> Authenticity:
+        """How a receiver knows who sent a packet of this lane."""
+        return Authenticity.SIGNATURE if lane == Lane.PRESENCE else self.authenticity
 
     def to_table(self) -> dict[str, Any]:
         """As in the policy file; `from_table` reads it."""

@@ -92,7 +92,7 @@ class Sealer:
         self._looked = 0
         self._versions = (-1, -1)
         self._entry = self._home.access.check(alias, lane, sends=True)
-        self._authenticity = self._entry.rule.authenticity
+        self._authenticity = self._entry.rule.authenticity_on(lane)
         self._name = bytes(self._entry.name)
         self._statements = Statements(self._name, lane)
         self._sender = key_id(self._entry.secret, b"sender", self._home.signing_key.public_key())
@@ -228,7 +228,7 @@ class Sealer:
         self._home.refresh()
         self._home.check(seconds)
         self._entry = self._home.access.check(self.alias, self.lane, sends=True)
-        if self._entry.name != self._name or self._entry.rule.authenticity != self._authenticity:
+        if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
             raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
         epoch = self._keyring.sealing(self.alias, seconds)
         if epoch.number != self._epoch or self._cipher is None:
