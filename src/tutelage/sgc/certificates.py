@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey
@@ -29,6 +29,17 @@ KEYS_EXTENSION = x509.ObjectIdentifier("2.25.14668184283680137315286885348831887
 _ROLES = (Role.NODE, Role.ROUTER)
 _BACKDATED = datetime.timedelta(minutes=5)  # clocks of the fleet may be late by this much
 _MAX_DER = 8192
+UNREADABLE = (
+    ValueError,
+    TypeError,
+    InvalidSignature,
+    UnsupportedAlgorithm,
+    x509.InvalidVersion,
+    x509.ExtensionNotFound,
+    x509.DuplicateExtension,
+    x509.UnsupportedGeneralNameType,
+)
+"""What reading a certificate from a stranger may raise."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +117,7 @@ def read_request(pem: bytes) -> Keys:
         asked = x509.load_pem_x509_csr(pem[:_MAX_DER])
         genuine = asked.is_signature_valid
         keys = _keys(asked)
-    except (ValueError, TypeError, InvalidSignature, x509.ExtensionNotFound, x509.DuplicateExtension) as error:
+    except UNREADABLE as error:
         raise Refused(Reason.MALFORMED, f"not a signing request: {error}") from None
     if not NODE_NAME.fullmatch(keys.common_name):
         raise Refused(Reason.MALFORMED, f"a signing request for the impossible name {keys.common_name!r}")
@@ -125,7 +136,7 @@ def read_leaf(certificate: x509.Certificate) -> Keys:
         keys = _keys(certificate)
         if certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca:
             raise ValueError("an authority's certificate")
-    except (ValueError, TypeError, x509.ExtensionNotFound, x509.DuplicateExtension) as error:
+    except UNREADABLE as error:
         raise Refused(Reason.MALFORMED, f"not a certificate of a node: {error}") from None
     if not PSEUDONYM.fullmatch(keys.common_name):
         raise Refused(Reason.MALFORMED, "the common name of a certificate is not a pseudonym")
@@ -140,7 +151,7 @@ def load(der: bytes) -> x509.Certificate:
     """
     try:
         return x509.load_der_x509_certificate(der[:_MAX_DER])
-    except (ValueError, TypeError) as error:
+    except UNREADABLE as error:
         raise Refused(Reason.MALFORMED, f"not a certificate: {error}") from None
 
 

@@ -259,13 +259,13 @@ class Home:
             return "bundle"
 
     def refresh(self) -> bool:
-        """Read again what changed on disk. True if something did. Cheap otherwise: looks at the times of three files.
+        """Read again what changed on disk. True if something did. Cheap otherwise: looks at the times of two files.
 
         Raises:
             KeysError: what is there cannot be believed; the previous state stays in force.
         """
         with self._lock:
-            seen = tuple(_stamp(self.path / name) for name in ("root.pem", "deny", "bundle"))
+            seen = tuple(_stamp(self.path / name) for name in ("deny", "bundle"))
             if seen == self._seen:
                 return False
             self._seen = seen

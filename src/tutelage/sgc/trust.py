@@ -10,11 +10,10 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey
 
-from tutelage.sgc.certificates import PSEUDONYM, der, load, raw, read_leaf
+from tutelage.sgc.certificates import PSEUDONYM, UNREADABLE, der, load, raw, read_leaf
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import NODE_NAME, Role
 from tutelage.sgc.signed import verified
@@ -172,7 +171,7 @@ class Trust:
             constraints = found.extensions.get_extension_for_class(x509.BasicConstraints).value
             usage = found.extensions.get_extension_for_class(x509.KeyUsage).value
             able = constraints.ca and usage.key_cert_sign and isinstance(found.public_key(), Ed25519PublicKey)
-        except (ValueError, x509.ExtensionNotFound, x509.DuplicateExtension) as error:
+        except UNREADABLE as error:
             raise Refused(Reason.MALFORMED, f"not the certificate of an authority: {error}") from None
         if not able:
             raise Refused(Reason.WRONG_AUTHORITY, "a certificate that may not issue others was used as an authority's")
@@ -228,5 +227,5 @@ def fingerprint(certificate: x509.Certificate) -> str:
 def _check_issued(certificate: x509.Certificate, issuer: x509.Certificate) -> None:
     try:
         certificate.verify_directly_issued_by(issuer)
-    except (InvalidSignature, ValueError, TypeError):
+    except UNREADABLE:
         raise Refused(Reason.WRONG_AUTHORITY, "a certificate that does not come from the fleet's root") from None
