@@ -22,8 +22,10 @@ _BLOCK = 1024
 
 
 class Window:
-    """Which sequence numbers were seen: the highest, and those of the `WINDOW` up to it, in blocks of bits (RFC 6479): a stream
-    takes as much memory as it has messages, and no bit is ever moved."""
+    """Which sequence numbers were seen: the highest, and those of the `WINDOW` up to it, in blocks of bits (RFC 6479).
+
+    A stream takes as much memory as it has messages, and no bit is ever moved.
+    """
 
     __slots__ = ("_blocks", "highest", "sent")
 
