@@ -11,13 +11,13 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.transport.base import Handle, NoReply, Transport, check_key
 from tutelage.sgc.transport.config import Endpoint, Identity, NetworkConfig, import_zenoh, zenoh_config, zenoh_settings
 from tutelage.sgc.transport.tunnel import TunnelClient
+from tutelage.sgc.workers import Workers
 
 if TYPE_CHECKING:
     import zenoh
@@ -73,8 +73,7 @@ class ZenohTransport(Transport):
         self._session: zenoh.Session | None = None
         self._closed = threading.Event()
         self._tunnels: dict[Endpoint, TunnelClient] = {}
-        self._pool = ThreadPoolExecutor(SERVING, "sgc-serve")
-        self._room = threading.BoundedSemaphore(SERVING + WAITING)
+        self._pool = Workers("sgc-serve", SERVING, WAITING)
         self._check_identity()
         if not self._connect():
             threading.Thread(target=self._keep_connecting, name="sgc-connect", daemon=True).start()
@@ -110,13 +109,10 @@ class ZenohTransport(Transport):
                 log.exception("a request could not be answered")
             finally:
                 query.drop()
-                self._room.release()
 
         def asked(query: zenoh.Query) -> None:
-            if self._closed.is_set() or not self._room.acquire(blocking=False):
+            if not self._pool.submit(answer, query):
                 query.drop()
-                return
-            self._pool.submit(answer, query)
 
         return self._declare(lambda session: session.declare_queryable(key, self._direct(asked)))
 
@@ -170,7 +166,7 @@ class ZenohTransport(Transport):
             session.close()
         for tunnel in self._tunnels.values():
             tunnel.close()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._pool.close()
 
     # -- connecting ---------------------------------------------------------------------------------------------------------
 
