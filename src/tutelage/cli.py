@@ -10,8 +10,9 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -22,6 +23,7 @@ from tyro.conf import Positional, arg
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import ExpertConfig, RunConfig
+from tutelage.sgc.commands import proxy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -298,6 +300,7 @@ def main(args: Sequence[str] | None = None) -> None:
         "train-expert": train_expert,
         "check": check,
         "info": info,
+        "proxy": proxy,
     }
     arguments = list(sys.argv[1:] if args is None else args)
     if arguments == ["--version"]:
@@ -319,10 +322,29 @@ def main(args: Sequence[str] | None = None) -> None:
         raise SystemExit(1) from None
 
 
-def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Callable[[], None]:
-    """The call that the arguments ask for. The parser's boxes become one line, like every other error."""
+def _parse(
+    verbs: Mapping[str, Any],
+    arguments: list[str],
+    prog: str = "tutelage",
+    description: str = "Supervised autonomy for robot fleets.",
+) -> Callable[[], None]:
+    """The call that the arguments ask for. The parser's boxes become one line, like every other error.
 
-    def later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    verbs: functions, or modules with `VERBS` of their own.
+    """
+    group = verbs.get(arguments[0]) if arguments else None
+    if isinstance(group, ModuleType):
+        return _parse(group.VERBS, arguments[1:], f"{prog} {arguments[0]}", group.__doc__ or "")
+
+    def later(verb: Any) -> Callable[..., Callable[[], None]]:
+        if isinstance(verb, ModuleType):  # here for the help only
+
+            def named() -> Callable[[], None]:
+                raise AssertionError(f"{verb.__name__} is parsed above")
+
+            named.__doc__ = verb.__doc__
+            return named
+
         @functools.wraps(verb)
         def call(*args: Any, **kwargs: Any) -> Callable[[], None]:
             return functools.partial(verb, *args, **kwargs)
@@ -334,9 +356,9 @@ def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Calla
         with contextlib.redirect_stderr(said):
             chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
                 {name: later(verb) for name, verb in verbs.items()},
-                prog="tutelage",
+                prog=prog,
                 args=arguments,
-                description="Supervised autonomy for robot fleets.",
+                description=description,
             )
         return chosen
     except SystemExit as stop:
@@ -347,4 +369,4 @@ def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Calla
     meant = re.search(r"Perhaps you meant:\s+(-\S+)", " ".join(lines))
     hint = f"; did you mean {meant[1]}?" if meant else ""
     verb = f" {arguments[0]}" if arguments and arguments[0] in verbs else ""
-    raise ConfigError(f"{problem}{hint} (see tutelage{verb} --help)")
+    raise ConfigError(f"{problem}{hint} (see {prog}{verb} --help)")

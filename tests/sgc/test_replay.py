@@ -26,7 +26,12 @@ def take(
     return None
 
 
-@given(st.lists(st.tuples(st.integers(1, 3 * WINDOW), st.sampled_from([1, 1, 1, 2, 70])), max_size=60))
+numbers_near_each_other = st.builds(
+    lambda base, offset: base + offset, st.sampled_from([1, 1000, WINDOW - 5, WINDOW, 2 * WINDOW]), st.integers(0, 40)
+)
+
+
+@given(st.lists(st.tuples(numbers_near_each_other, st.sampled_from([1, 1, 1, 2, 70, 3000])), max_size=60))
 def test_the_window_agrees_with_a_set(batches: list[tuple[int, int]]) -> None:
     window, seen = Window(), set[int]()
     for first, count in batches:
@@ -115,3 +120,14 @@ def test_no_message_is_ever_taken_twice_however_many_streams_there_are(messages:
                 assert message not in taken
                 taken.add(message)
         assert len(replay._senders) <= 4
+
+
+def test_a_window_takes_as_much_memory_as_it_needs() -> None:
+    window = Window()
+    for k in range(1, 10 * WINDOW, 1 << 16):
+        window.add(k, 1, 0)
+    assert len(window._blocks) <= 4
+    window = Window()
+    for k in range(1, 4 * WINDOW, 1000):
+        window.add(k, 1000, 0)
+    assert len(window._blocks) <= WINDOW // 1024 + 2
