@@ -1,4 +1,4 @@
-"""A fleet for tests: an authority, homes with certificates, and routers on loopback. All keys are real."""
+"""Policies, routers and patience for the tests of the network."""
 
 from __future__ import annotations
 
@@ -7,21 +7,9 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from tutelage.sgc.access import Role
-from tutelage.sgc.authority import Authority
-from tutelage.sgc.home import Home
+from members import Fleet
 
-CAMERA = """
-version = 1
-
-[topics.camera]
-node = "drone"
-interface = "/camera"
-type = "sensor_msgs/msg/Image"
-owner = "drone"
-publish = ["drone"]
-subscribe = ["server", "operator-*"]
-"""
+from tutelage.sgc.rules import Role
 
 
 def topic(alias: str, publish: Iterable[str], subscribe: Iterable[str], **fields: object) -> str:
@@ -66,35 +54,14 @@ def _text(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
-class Fleet:
-    """An authority in a folder, and the homes that it has issued."""
-
-    def __init__(self, folder: Path, policy: str, nodes: Iterable[str], routers: Iterable[str] = ()) -> None:
-        self.folder = folder
-        self.authority = Authority.create(folder / "authority", "acme")
-        self.homes: dict[str, Home] = {}
-        for name in routers:
-            self.join(name, Role.ROUTER)
-        for name in nodes:
-            self.join(name)
-        self.publish(policy)
-
-    def join(self, name: str, role: Role = Role.NODE) -> Home:
-        """A new member."""
-        addresses = ["127.0.0.1", "localhost"] if role == Role.ROUTER else []
-        home = self.homes[name] = Home.create(self.folder / name, name, role=role, addresses=addresses)
-        home.accept(self.authority.issue(home.request()))
-        return home
-
-    def publish(self, policy: str) -> None:
-        """A new policy, carried to all members."""
-        text = policy if "version = 1" in policy else f"version = 1\n{policy}"
-        (self.authority.path / "policy.toml").write_text(text)
-        for name, bundle in self.authority.publish().items():
-            self.homes[name].accept(bundle)
-
-    def __getitem__(self, name: str) -> Home:
-        return self.homes[name]
+def make_fleet(folder: Path, policy: str, nodes: Iterable[str], routers: Iterable[str] = ()) -> Fleet:
+    """A fleet whose keys are still to be handed out."""
+    text = policy if "version = 1" in policy else f"version = 1\n{policy}"
+    fleet = Fleet(folder, nodes, text, share=False)
+    for name in routers:
+        fleet.join(name, Role.ROUTER)
+    fleet.publish(text)
+    return fleet
 
 
 def free_port() -> int:
