@@ -129,7 +129,7 @@ class Heard:
     def of(cls, listener: subprocess.Popen[bytes]) -> Heard:
         """So far."""
         text = listener.output.read_text()  # type: ignore[attr-defined]
-        rows = [line.split() for line in text.splitlines()[1:] if line.count(" ") == 2 and text.endswith("\n")]
+        rows = [line.split() for line in text.rpartition("\n")[0].splitlines()[1:] if line.count(" ") == 2]
         assert "Traceback" not in text, text
         return cls([int(row[0]) for row in rows], [float(row[1]) for row in rows], int(rows[-1][2]) if rows else 0)
 
