@@ -28,7 +28,7 @@ def test_a_policy_is_read_with_its_defaults() -> None:
     assert (camera.kind, camera.authenticity, camera.delivery) == (Kind.STREAM, Authenticity.SIGNATURE, Delivery.RELIABLE)
     assert (camera.max_age, camera.rotate_every) == (None, 3600.0)
     assert (teleop.authenticity, teleop.max_age) == (Authenticity.SESSION, 0.5)
-    assert grasp.lanes() == (Lane.REQUEST, Lane.REPLY)
+    assert grasp.lanes() == (Lane.REQUEST, Lane.REPLY, Lane.PRESENCE)
 
 
 def test_wildcards_name_many_nodes() -> None:
@@ -47,6 +47,14 @@ def test_a_service_has_two_lanes_with_their_own_senders() -> None:
     assert not grasp.may_send("drone-1", Lane.REPLY)
     assert grasp.may_send("server", Lane.REPLY)
     assert grasp.may_receive("drone-1", Lane.REPLY)
+
+
+def test_all_members_of_a_topic_may_tell_each_other_that_they_are_there_by_signature() -> None:
+    teleop = Policy.parse(POLICY).topics["teleop"]
+    for node, member in (("operator-7", True), ("drone-1", True), ("drone-2", False)):
+        assert teleop.may_send(node, Lane.PRESENCE) == teleop.may_receive(node, Lane.PRESENCE) == member
+    assert teleop.authenticity_on(Lane.PRESENCE) == Authenticity.SIGNATURE
+    assert teleop.authenticity_on(Lane.STREAM) == Authenticity.SESSION
 
 
 def test_rules_survive_being_written() -> None:
@@ -150,6 +158,7 @@ def test_a_router_is_told_names_and_pseudonyms_but_no_metadata_and_no_secret(fle
     assert route.owner == nodes["drone-1"]
     assert route.send == {nodes["drone-1"], nodes["drone-2"]}
     assert route.receive == {nodes["server"], nodes["operator-1"]}
+    assert router.access.routers == {nodes.pop("router-1")}
     assert router.access.members == set(nodes.values())
     told = router.access.to_json()
     secrets = [entry.secret.hex() for entry in drone.access.topics.values()]

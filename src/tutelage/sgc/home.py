@@ -322,7 +322,8 @@ def _read_root(path: Path) -> x509.Certificate:
 
 def _write_if_other(path: Path, content: bytes) -> None:
     if not path.exists() or path.read_bytes() != content:
-        write_atomic(path, content)
+        with locked(path.with_name(".files.lock")):  # a running node and `tutelage keys` see a new bundle at the same time
+            write_atomic(path, content)
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:

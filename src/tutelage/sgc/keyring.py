@@ -20,6 +20,7 @@ from tutelage.sgc.grants import NONCE_BYTES
 from tutelage.sgc.home import Home
 from tutelage.sgc.keyfile import TopicKeys
 from tutelage.sgc.reasons import Reason, Refusals, Refused
+from tutelage.sgc.rules import Lane
 from tutelage.sgc.trust import Member
 
 _MAX_ASKED = 32
@@ -239,7 +240,7 @@ class Keyring:
         rule, epoch = keys.entry.rule, keys.epochs.sealing(now)
         if epoch is None or epoch.ends - now < rule.rotate_every / 2:
             return True
-        sends = any(rule.may_send(self.home.name, lane) for lane in rule.lanes())
+        sends = any(rule.may_send(self.home.name, lane) for lane in rule.lanes() if lane != Lane.PRESENCE)
         return sends and now - self._answered.get(alias, 0.0) > self._grace
 
     def _keys(self, alias: str, now: float) -> TopicKeys:

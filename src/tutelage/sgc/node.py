@@ -14,7 +14,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -33,6 +33,7 @@ from tutelage.sgc.sealing import Opener, Sealer
 from tutelage.sgc.service import Requester, Server
 from tutelage.sgc.subscription import Subscription
 from tutelage.sgc.transport.base import Handle, NoReply, Transport
+from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
 
@@ -47,8 +48,6 @@ ASK_AGAIN = 0.1, 2.0
 
 GOSSIP = 10.0
 """Seconds after which the deny list is passed on again."""
-
-WORKERS = 8
 
 
 class Node:
@@ -69,7 +68,7 @@ class Node:
         self._requesters: dict[str, Requester] = {}
         self._servers: dict[str, Server] = {}
         self._handles: list[Handle] = []
-        self._pool = ThreadPoolExecutor(WORKERS, "sgc-ask")
+        self._pool = Workers("sgc-ask")
         self._wake = threading.Event()
         self._closed = threading.Event()
         self._asked: dict[str, tuple[float, float]] = {}  # alias -> when to ask again, and the pause after that
@@ -81,6 +80,9 @@ class Node:
         self._deny_key = lanes.key(self.access.control, lanes.DENY)
         self._handles.append(transport.subscribe(self._deny_key, self._on_deny))
         self._presence = Presence(self.keyring, self.access.topics, home.pseudonym, transport, self._need_key, self._pool)
+        for alias, entry in self.access.topics.items():
+            if not self.keyring.owns(alias):
+                self._presence.directory.subscribe(entry.name, partial(self._somebody_came, alias))
         self._thread = threading.Thread(target=self._tend, name="sgc-tend", daemon=True)
         self._thread.start()
 
@@ -186,7 +188,7 @@ class Node:
         entry = self._entry(alias, Kind.SERVICE)
         sealer, opener = Sealer(self.keyring, alias, Lane.REPLY), Opener(self.keyring, alias, Lane.REQUEST)
         server = self._servers[alias] = Server(alias, sealer, opener, handler)
-        handle = self.transport.serve(lanes.key(entry.name, lanes.CALL), server.answer)
+        handle = self.transport.serve(lanes.key(entry.name, lanes.CALL), server.answer, slow=True)
         self._handles.append(handle)
         return handle
 
@@ -221,7 +223,7 @@ class Node:
             handle.close()
         if self._presence is not None:
             self._presence.close()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._pool.close()
         if threading.current_thread() is not self._thread:
             self._thread.join(2 * ASK_TIMEOUT)
         if self._own_transport:
@@ -310,20 +312,31 @@ class Node:
         """Ask owners for the keys that we lack. Returns the seconds until the next attempt."""
         now = time.monotonic()
         for alias in self.keyring.wanted():
-            at, pause = self._asked.get(alias, (now, ASK_AGAIN[0]))
-            if at > now:
-                continue
-            self._asked[alias] = (now + ASK_TIMEOUT + pause, min(2 * pause, ASK_AGAIN[1]))
+            with self._lock:
+                at, pause = self._asked.get(alias, (now, ASK_AGAIN[0]))
+                if at > now:
+                    continue
+                self._asked[alias] = (now + ASK_TIMEOUT + pause, min(2 * pause, ASK_AGAIN[1]))
             self._pool.submit(self._ask, alias)
-        return min((at - now for at, _ in self._asked.values()), default=TEND)
+        with self._lock:
+            return min((at - now for at, _ in self._asked.values()), default=TEND)
+
+    def _somebody_came(self, alias: str, who: str) -> None:
+        """It may be the owner of a topic whose key we lack."""
+        with self._lock:
+            waiting = self._asked.pop(alias, None)
+        if waiting is not None:
+            self._wake.set()
 
     def _ask(self, alias: str) -> None:
         try:
             key = lanes.key(self.access.entry(alias).name, lanes.KEYS)
             self._accept(alias, self.transport.request(key, self.keyring.ask(alias), ASK_TIMEOUT))
         except NoReply:
-            at, pause = self._asked.get(alias, (0.0, ASK_AGAIN[0]))
-            self._asked[alias] = (min(at, time.monotonic() + pause), pause)
+            with self._lock:
+                if alias in self._asked:
+                    at, pause = self._asked[alias]
+                    self._asked[alias] = (min(at, time.monotonic() + pause), pause)
             self._wake.set()
         except TutelageError as error:
             log.warning("no key of %s: %s", alias, error)

@@ -5,10 +5,10 @@ Anybody who carries our packets can invent a token; the answer to a ping is seal
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, wait
 from dataclasses import dataclass
 
 from tutelage.errors import TutelageError
@@ -19,6 +19,7 @@ from tutelage.sgc.keyring import Keyring
 from tutelage.sgc.sealing import Opener, Sealer
 from tutelage.sgc.service import Requester, Server
 from tutelage.sgc.transport.base import Handle, NoReply, Transport
+from tutelage.sgc.workers import Workers
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Presence:
         pseudonym: str,
         transport: Transport,
         need_key: Callable[[], None],
-        pool: Executor,
+        pool: Workers,
     ) -> None:
         self.directory = Directory(transport)
         self._topics = topics
@@ -69,7 +70,11 @@ class Presence:
         """Who is there and answers; those met for the first time are asked who they are, for at most `timeout` seconds."""
         present = self._present()
         strangers = {who: aliases[0] for who, aliases in present.items() if who not in self._known}
-        wait([self._pool.submit(self._meet, who, alias, timeout) for who, alias in strangers.items()], timeout)
+        met = threading.Semaphore(0)
+        asked = sum(self._pool.submit(self._meet, who, alias, timeout, met) for who, alias in strangers.items())
+        until = time.monotonic() + timeout
+        for _ in range(asked):
+            met.acquire(timeout=max(0.0, until - time.monotonic()))
         with self._lock:
             known = {who: self._known[who] for who in present if who in self._known}
         return sorted(
@@ -110,11 +115,11 @@ class Presence:
                 present.setdefault(who, []).append(alias)
         return present
 
-    def _meet(self, who: str, alias: str, timeout: float) -> None:
-        try:
+    def _meet(self, who: str, alias: str, timeout: float, met: threading.Semaphore | None = None) -> None:
+        with contextlib.suppress(TutelageError):  # not there any more, or a token that somebody invented
             self._echo(who, alias, timeout)
-        except TutelageError:  # not there any more, or a token that somebody invented
-            return
+        if met is not None:
+            met.release()
 
     def _echo(self, who: str, alias: str, timeout: float) -> tuple[str, float]:
         with self._lock:

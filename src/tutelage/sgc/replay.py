@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
 
 from tutelage.sgc.reasons import Reason, Refused
 
@@ -17,40 +18,52 @@ MAX_SALTS = 8
 MAX_SENDERS = 1024
 TOLERANCE_NS = 5_000_000_000
 """By how much clocks of sender and receiver may differ: 5 seconds."""
-_ONES = (1 << WINDOW) - 1
+_BLOCK = 1024
 
 
 class Window:
-    """Which sequence numbers were seen: the highest, and a bit for each of the `WINDOW` up to it."""
+    """Which sequence numbers were seen: the highest, and those of the `WINDOW` up to it, in blocks of bits (RFC 6479).
 
-    __slots__ = ("highest", "seen", "sent")
+    A stream takes as much memory as it has messages, and no bit is ever moved.
+    """
+
+    __slots__ = ("_blocks", "highest", "sent")
 
     def __init__(self) -> None:
+        self._blocks: dict[int, int] = {}
         self.highest = 0
-        self.seen = 0
         self.sent = 0
         """Newest time of sending, nanoseconds."""
 
     def fresh(self, first: int, count: int) -> bool:
         """Are all of `first`, ..., `first + count - 1` new, and not behind the window?"""
-        behind = self.highest - first
-        if behind < 0:
+        if first > self.highest:
             return True
-        # The oldest must be in the window; those beyond the highest are new anyway.
-        if behind >= WINDOW:
+        if self.highest - first >= WINDOW:
             return False
-        low = max(behind - count + 1, 0)
-        return not (self.seen >> low) & ((1 << (behind - low + 1)) - 1)
+        if count == 1:
+            return not self._blocks.get(first // _BLOCK, 0) >> first % _BLOCK & 1
+        return not any(self._blocks.get(block, 0) & bits for block, bits in _spans(first, count))
 
     def add(self, first: int, count: int, sent: int) -> None:
         """Mark them as seen."""
+        for block, bits in _spans(first, count):
+            self._blocks[block] = self._blocks.get(block, 0) | bits
         last = first + count - 1
-        if last > self.highest:
-            self.seen = (self.seen << min(last - self.highest, WINDOW)) & _ONES
-            self.highest = last
-        low = self.highest - last
-        self.seen |= (((1 << count) - 1) << low) & _ONES
+        if last // _BLOCK > self.highest // _BLOCK:
+            oldest = (last - WINDOW) // _BLOCK
+            for block in [block for block in self._blocks if block < oldest]:
+                del self._blocks[block]
+        self.highest = max(self.highest, last)
         self.sent = max(self.sent, sent)
+
+
+def _spans(first: int, count: int) -> Iterator[tuple[int, int]]:
+    """The blocks that these numbers lie in, and their bits there."""
+    last = first + count - 1
+    for block in range(first // _BLOCK, last // _BLOCK + 1):
+        low, high = max(first - block * _BLOCK, 0), min(last - block * _BLOCK, _BLOCK - 1)
+        yield block, ((1 << high - low + 1) - 1) << low
 
 
 class Replay:

@@ -173,7 +173,7 @@ class TopicRule:
                 wanted = " and ".join(_OF_KIND[self.kind])
                 raise ConfigError(f"{where} is a {self.kind}, which has {wanted}, not {who}")
         if self.kind == Kind.SERVICE and self.authenticity != Authenticity.SIGNATURE:
-            raise ConfigError(f'{where}: a service needs authenticity = "signature", not {self.authenticity!r}')
+            raise ConfigError(f'{where}: a service needs authenticity = "signature", not "{self.authenticity}"')
         if self.kind == Kind.SERVICE and self.delivery != Delivery.RELIABLE:
             raise ConfigError(f"{where}: a service is always reliable; leave delivery out")
 

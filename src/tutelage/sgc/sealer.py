@@ -150,7 +150,7 @@ class Sealer:
             NotAllowed: the topic's authenticity is not "session".
         """
         if self._authenticity != Authenticity.SESSION:
-            raise NotAllowed(f"{self.alias} has authenticity {self._authenticity!r} in the policy, so it has no sessions")
+            raise NotAllowed(f'{self.alias} has authenticity "{self._authenticity}" in the policy, so it has no sessions')
         with self._lock:
             try:
                 answer, session = self._handshake.answer(offer, self._sender, self.salt)

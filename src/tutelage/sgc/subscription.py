@@ -13,7 +13,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -26,6 +25,7 @@ from tutelage.sgc.messages import Message
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.sealing import Opened, Opener
 from tutelage.sgc.transport.base import NoReply, Transport
+from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class Subscription:
         opener: Opener,
         transport: Transport,
         need_key: Callable[[], None],
-        pool: Executor,
+        pool: Workers,
         on_message: Callable[[Message], None] | None,
         queue: int | None,
     ) -> None:
@@ -360,7 +360,8 @@ class Subscription:
             self._offer()
         self._pass_on(self._messages(self.delivery.due(now), time.time()))
         for salt, ranges in self.delivery.questions(now):
-            self._pool.submit(self._ask, salt, ranges)
+            if not self._pool.submit(self._ask, salt, ranges):
+                self.delivery.answered(salt, 0, now)  # too busy: ask again later
 
     def _ask(self, salt: bytes, ranges: list[tuple[int, int]]) -> None:
         """On the pool: ask the publisher for what is missing."""

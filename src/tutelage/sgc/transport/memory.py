@@ -15,12 +15,19 @@ T = TypeVar("T")
 Tap = Callable[[str, bytes], Iterable[tuple[str, bytes]]]
 """What a router does with a packet: takes key and payload, returns what is delivered in its place."""
 
+Rewrite = Callable[[str, bytes], bytes | None]
+"""What a router does with a request or an answer: takes key and payload, returns another payload; None: dropped."""
+
 
 class Network:
     """A wire that joins the transports made with it."""
 
     def __init__(self, tap: Tap | None = None) -> None:
         self.tap = tap
+        self.ask_tap: Rewrite | None = None
+        """The same for requests."""
+        self.answer_tap: Rewrite | None = None
+        """The same for the answers to them."""
         self.up = True
         """False: nobody is connected; packets are lost and requests are not answered."""
         self.lock = threading.RLock()
@@ -67,14 +74,19 @@ class MemoryTransport(Transport):
     def subscribe(self, key: str, on_packet: Callable[[bytes], None]) -> Handle:
         return self._add(self.network.subscribers, (check_key(key, wildcard=True), on_packet))
 
-    def serve(self, key: str, on_request: Callable[[bytes], bytes | None]) -> Handle:
+    def serve(self, key: str, on_request: Callable[[bytes], bytes | None], *, slow: bool = False) -> Handle:
         return self._add(self.network.servers, (check_key(key), on_request))
 
     def request(self, key: str, payload: bytes | bytearray, timeout: float) -> bytes:
         with self.network.lock:
             serving = [call for pattern, call in self.network.servers.values() if matches(pattern, check_key(key))]
-        for call in serving if self.network.up else []:
-            reply = call(bytes(payload))
+        asked: bytes | None = bytes(payload)
+        if asked is not None and self.network.ask_tap is not None:
+            asked = self.network.ask_tap(key, asked)
+        for call in serving:
+            reply = call(asked) if self.network.up and asked is not None else None
+            if reply is not None and self.network.answer_tap is not None:
+                reply = self.network.answer_tap(key, reply)
             if reply is not None:
                 return reply
         raise NoReply(f"nobody answered within {timeout:g} s")

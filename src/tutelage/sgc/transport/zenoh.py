@@ -11,13 +11,13 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.transport.base import Handle, NoReply, Transport, check_key
 from tutelage.sgc.transport.config import Endpoint, Identity, NetworkConfig, import_zenoh, zenoh_config, zenoh_settings
 from tutelage.sgc.transport.tunnel import TunnelClient
+from tutelage.sgc.workers import Workers
 
 if TYPE_CHECKING:
     import zenoh
@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 OVERLAP = 0.5
 """Seconds for which `renew` keeps the old connection beside the new one, until the routers know the new one."""
 
-SERVING = 8
-"""Requests that are answered at a time."""
+SERVING, SLOW = 8, 32
+"""Requests that are answered at a time: on all keys together, and on each key whose answers are slow."""
 
 WAITING = 64
 """Requests that may wait for that; further ones are turned away at once."""
@@ -73,8 +73,7 @@ class ZenohTransport(Transport):
         self._session: zenoh.Session | None = None
         self._closed = threading.Event()
         self._tunnels: dict[Endpoint, TunnelClient] = {}
-        self._pool = ThreadPoolExecutor(SERVING, "sgc-serve")
-        self._room = threading.BoundedSemaphore(SERVING + WAITING)
+        self._pool = Workers("sgc-serve", SERVING, WAITING)
         self._check_identity()
         if not self._connect():
             threading.Thread(target=self._keep_connecting, name="sgc-connect", daemon=True).start()
@@ -98,8 +97,9 @@ class ZenohTransport(Transport):
 
         return self._declare(lambda session: session.declare_subscriber(key, self._direct(arrived)))
 
-    def serve(self, key: str, on_request: Callable[[bytes], bytes | None]) -> Handle:
+    def serve(self, key: str, on_request: Callable[[bytes], bytes | None], *, slow: bool = False) -> Handle:
         check_key(key)
+        pool = Workers("sgc-serve", SLOW, WAITING) if slow else self._pool
 
         def answer(query: zenoh.Query) -> None:
             try:
@@ -110,15 +110,20 @@ class ZenohTransport(Transport):
                 log.exception("a request could not be answered")
             finally:
                 query.drop()
-                self._room.release()
 
         def asked(query: zenoh.Query) -> None:
-            if self._closed.is_set() or not self._room.acquire(blocking=False):
+            if not pool.submit(answer, query):
                 query.drop()
-                return
-            self._pool.submit(answer, query)
 
-        return self._declare(lambda session: session.declare_queryable(key, self._direct(asked)))
+        handle = self._declare(lambda session: session.declare_queryable(key, self._direct(asked)))
+        if not slow:
+            return handle
+
+        def stop() -> None:
+            handle.close()
+            pool.close()
+
+        return Handle(stop)
 
     def request(self, key: str, payload: bytes | bytearray, timeout: float) -> bytes:
         check_key(key)
@@ -170,7 +175,7 @@ class ZenohTransport(Transport):
             session.close()
         for tunnel in self._tunnels.values():
             tunnel.close()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._pool.close()
 
     # -- connecting ---------------------------------------------------------------------------------------------------------
 
