@@ -23,7 +23,7 @@ from tyro.conf import Positional, arg
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import ExpertConfig, RunConfig
-from tutelage.sgc.commands import proxy
+from tutelage.sgc.commands import keys, proxy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -300,6 +300,7 @@ def main(args: Sequence[str] | None = None) -> None:
         "train-expert": train_expert,
         "check": check,
         "info": info,
+        "keys": keys,
         "proxy": proxy,
     }
     arguments = list(sys.argv[1:] if args is None else args)
