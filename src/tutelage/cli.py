@@ -24,6 +24,9 @@ from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import ExpertConfig, RunConfig
 from tutelage.sgc.commands import keys, proxy
+from tutelage.sgc.commands.ping import ping
+from tutelage.sgc.commands.router import router
+from tutelage.sgc.commands.top import top
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -301,7 +304,10 @@ def main(args: Sequence[str] | None = None) -> None:
         "check": check,
         "info": info,
         "keys": keys,
+        "router": router,
         "proxy": proxy,
+        "ping": ping,
+        "top": top,
     }
     arguments = list(sys.argv[1:] if args is None else args)
     if arguments == ["--version"]:

@@ -1,27 +1,18 @@
-"""A fleet for tests: an authority, homes with certificates, and routers on loopback. All keys are real."""
+"""Policies, routers and patience for the tests of the network."""
 
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from tutelage.sgc.access import Role
-from tutelage.sgc.authority import Authority
-from tutelage.sgc.home import Home
+from members import Fleet
 
-CAMERA = """
-version = 1
-
-[topics.camera]
-node = "drone"
-interface = "/camera"
-type = "sensor_msgs/msg/Image"
-owner = "drone"
-publish = ["drone"]
-subscribe = ["server", "operator-*"]
-"""
+from tutelage.sgc.rules import Role
 
 
 def topic(alias: str, publish: Iterable[str], subscribe: Iterable[str], **fields: object) -> str:
@@ -66,35 +57,14 @@ def _text(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
-class Fleet:
-    """An authority in a folder, and the homes that it has issued."""
-
-    def __init__(self, folder: Path, policy: str, nodes: Iterable[str], routers: Iterable[str] = ()) -> None:
-        self.folder = folder
-        self.authority = Authority.create(folder / "authority", "acme")
-        self.homes: dict[str, Home] = {}
-        for name in routers:
-            self.join(name, Role.ROUTER)
-        for name in nodes:
-            self.join(name)
-        self.publish(policy)
-
-    def join(self, name: str, role: Role = Role.NODE) -> Home:
-        """A new member."""
-        addresses = ["127.0.0.1", "localhost"] if role == Role.ROUTER else []
-        home = self.homes[name] = Home.create(self.folder / name, name, role=role, addresses=addresses)
-        home.accept(self.authority.issue(home.request()))
-        return home
-
-    def publish(self, policy: str) -> None:
-        """A new policy, carried to all members."""
-        text = policy if "version = 1" in policy else f"version = 1\n{policy}"
-        (self.authority.path / "policy.toml").write_text(text)
-        for name, bundle in self.authority.publish().items():
-            self.homes[name].accept(bundle)
-
-    def __getitem__(self, name: str) -> Home:
-        return self.homes[name]
+def make_fleet(folder: Path, policy: str, nodes: Iterable[str], routers: Iterable[str] = ()) -> Fleet:
+    """A fleet whose keys are still to be handed out."""
+    text = policy if "version = 1" in policy else f"version = 1\n{policy}"
+    fleet = Fleet(folder, nodes, text, share=False)
+    for name in routers:
+        fleet.join(name, Role.ROUTER)
+    fleet.publish(text)
+    return fleet
 
 
 def free_port() -> int:
@@ -110,3 +80,65 @@ def eventually(condition: Callable[[], object], timeout: float = 10.0, every: fl
     while not condition():
         assert time.monotonic() < until, "it did not happen in time"
         time.sleep(every)
+
+
+class Programs:
+    """Programs of `beacon.py`, each in its own process; all end with the test."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.running: list[subprocess.Popen[bytes]] = []
+
+    def start(self, *arguments: object, inside: Sequence[str] = ()) -> subprocess.Popen[bytes]:
+        """Start one and wait until it is up. inside: words before the command, such as ip netns exec."""
+        output = self.folder / f"{len(self.running)}-{arguments[0]}.log"
+        command = [*inside, sys.executable, str(Path(__file__).with_name("beacon.py")), *map(str, arguments)]
+        with output.open("wb") as file:
+            program = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+        program.output = output  # type: ignore[attr-defined]
+        self.running.append(program)
+        eventually(lambda: "up\n" in output.read_text() or self._died(program), 30.0, every=0.02)
+        return program
+
+    def _died(self, program: subprocess.Popen[bytes]) -> bool:
+        assert program.poll() is None, program.output.read_text()  # type: ignore[attr-defined]
+        return False
+
+    def close(self) -> None:
+        """End all."""
+        for program in self.running:
+            program.kill()
+            program.wait()
+
+    def __enter__(self) -> Programs:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a listener printed: numbers, when each came (seconds), and how many the subscription called lost."""
+
+    numbers: list[int]
+    times: list[float]
+    lost: int
+
+    @classmethod
+    def of(cls, listener: subprocess.Popen[bytes]) -> Heard:
+        """So far."""
+        text = listener.output.read_text()  # type: ignore[attr-defined]
+        rows = [line.split() for line in text.rpartition("\n")[0].splitlines()[1:] if line.count(" ") == 2]
+        assert "Traceback" not in text, text
+        return cls([int(row[0]) for row in rows], [float(row[1]) for row in rows], int(rows[-1][2]) if rows else 0)
+
+    @property
+    def in_order(self) -> bool:
+        """Each number once, none missing, none out of order."""
+        return self.numbers == list(range(self.numbers[0], self.numbers[0] + len(self.numbers)))
+
+    def gap(self, since: float) -> float:
+        """The longest silence after a moment, seconds."""
+        times = [since, *(t for t in self.times if t >= since)]
+        return max((b - a for a, b in zip(times, times[1:], strict=False)), default=float("inf"))

@@ -73,9 +73,11 @@ class Fleet:
         if share:
             self.share()
 
-    def join(self, name: str, role: Role = Role.NODE, hours: float = 24.0) -> Home:
+    def join(
+        self, name: str, role: Role = Role.NODE, hours: float = 24.0, addresses: Iterable[str] = ("127.0.0.1",)
+    ) -> Home:
         """A new member."""
-        home = Home.create(self.path / name, name, role=role, addresses=("127.0.0.1",) if role == Role.ROUTER else ())
+        home = Home.create(self.path / name, name, role=role, addresses=tuple(addresses) if role == Role.ROUTER else ())
         home.accept(self.authority.issue(home.request(), hours=hours))
         self.homes[name] = home
         if role == Role.NODE:

@@ -191,7 +191,7 @@ class Node:
         entry = self._entry(alias, Kind.SERVICE)
         sealer, opener = Sealer(self.keyring, alias, Lane.REPLY), Opener(self.keyring, alias, Lane.REQUEST)
         server = self._servers[alias] = Server(alias, sealer, opener, handler)
-        handle = self.transport.serve(lanes.key(entry.name, lanes.CALL), server.answer)
+        handle = self.transport.serve(lanes.key(entry.name, lanes.CALL), server.answer, slow=True)
         self._handles.append(handle)
         return handle
 

@@ -76,8 +76,11 @@ class Transport(ABC):
         """Call `on_packet` with each packet under the key, which may hold wildcards."""
 
     @abstractmethod
-    def serve(self, key: str, on_request: Callable[[bytes], bytes | None]) -> Handle:
-        """Answer requests under the key; None: no answer."""
+    def serve(self, key: str, on_request: Callable[[bytes], bytes | None], *, slow: bool = False) -> Handle:
+        """Answer requests under the key; None: no answer.
+
+        slow: answers take their time, so they get threads of their own, rather than those that all keys share.
+        """
 
     @abstractmethod
     def request(self, key: str, payload: bytes | bytearray, timeout: float) -> bytes:

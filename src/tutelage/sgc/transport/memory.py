@@ -74,7 +74,7 @@ class MemoryTransport(Transport):
     def subscribe(self, key: str, on_packet: Callable[[bytes], None]) -> Handle:
         return self._add(self.network.subscribers, (check_key(key, wildcard=True), on_packet))
 
-    def serve(self, key: str, on_request: Callable[[bytes], bytes | None]) -> Handle:
+    def serve(self, key: str, on_request: Callable[[bytes], bytes | None], *, slow: bool = False) -> Handle:
         return self._add(self.network.servers, (check_key(key), on_request))
 
     def request(self, key: str, payload: bytes | bytearray, timeout: float) -> bytes:

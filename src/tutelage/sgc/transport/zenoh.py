@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 OVERLAP = 0.5
 """Seconds for which `renew` keeps the old connection beside the new one, until the routers know the new one."""
 
-SERVING = 8
-"""Requests that are answered at a time."""
+SERVING, SLOW = 8, 32
+"""Requests that are answered at a time: on all keys together, and on each key whose answers are slow."""
 
 WAITING = 64
 """Requests that may wait for that; further ones are turned away at once."""
@@ -97,8 +97,9 @@ class ZenohTransport(Transport):
 
         return self._declare(lambda session: session.declare_subscriber(key, self._direct(arrived)))
 
-    def serve(self, key: str, on_request: Callable[[bytes], bytes | None]) -> Handle:
+    def serve(self, key: str, on_request: Callable[[bytes], bytes | None], *, slow: bool = False) -> Handle:
         check_key(key)
+        pool = Workers("sgc-serve", SLOW, WAITING) if slow else self._pool
 
         def answer(query: zenoh.Query) -> None:
             try:
@@ -111,10 +112,18 @@ class ZenohTransport(Transport):
                 query.drop()
 
         def asked(query: zenoh.Query) -> None:
-            if not self._pool.submit(answer, query):
+            if not pool.submit(answer, query):
                 query.drop()
 
-        return self._declare(lambda session: session.declare_queryable(key, self._direct(asked)))
+        handle = self._declare(lambda session: session.declare_queryable(key, self._direct(asked)))
+        if not slow:
+            return handle
+
+        def stop() -> None:
+            handle.close()
+            pool.close()
+
+        return Handle(stop)
 
     def request(self, key: str, payload: bytes | bytearray, timeout: float) -> bytes:
         check_key(key)
