@@ -23,7 +23,7 @@ from tyro.conf import Positional, arg
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import ExpertConfig, RunConfig
-from tutelage.sgc.commands import proxy
+from tutelage.sgc.commands import keys, proxy
 from tutelage.sgc.commands.ping import ping
 from tutelage.sgc.commands.router import router
 from tutelage.sgc.commands.top import top
@@ -303,6 +303,7 @@ def main(args: Sequence[str] | None = None) -> None:
         "train-expert": train_expert,
         "check": check,
         "info": info,
+        "keys": keys,
         "router": router,
         "proxy": proxy,
         "ping": ping,

@@ -29,9 +29,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from tutelage.files import locked, write_atomic
+from tutelage.files import Lock, write_atomic
 from tutelage.sgc import certificates
-from tutelage.sgc.access import Access, Entry
+from tutelage.sgc.access import Access, Entry, Renewals
 from tutelage.sgc.bundle import Bundle
 from tutelage.sgc.certificates import raw
 from tutelage.sgc.envelope import derive
@@ -50,7 +50,9 @@ AUTHORITY_DAYS = 366.0
 ROOT_DAYS = 3660.0
 POLICY = """version = 1
 
-# Who may say and hear what. Without a table here nobody may do anything. After a change: tutelage keys issue --policy
+# Who may say and hear what. Without a table here nobody may do anything. After a change: tutelage keys issue FOLDER --policy
+#
+# renewals = "office"               # the node that renews certificates over the network: tutelage keys serve
 #
 # [topics.camera]
 # node = "drone-1"                  # metadata: its 256-bit name is made from it
@@ -71,6 +73,7 @@ class Authority:
     def __init__(self, path: Path) -> None:
         """Use `Authority.open`."""
         self.path = path
+        self._lock = Lock(path / ".lock")
         try:
             self._roster = Roster.load(path / "state.json")
             self._secret = (path / "names.secret").read_bytes()
@@ -144,6 +147,11 @@ class Authority:
         """Members, revoked pseudonyms, serials. To be read only."""
         return self._roster
 
+    def refresh(self) -> None:
+        """Read again what another process changed."""
+        with self._lock:
+            self._roster = Roster.load(self.path / "state.json")
+
     def renew_own(self, root_key: Path | None = None, passphrase: bytes | None = None) -> None:
         """A new key and certificate for the authority itself; leaves that the old one signed stay valid until they expire.
 
@@ -185,6 +193,8 @@ class Authority:
             if name := self._roster.revoked_as(keys):
                 raise KeysError(f"these keys were revoked with {name}; make a new home on the node: tutelage keys init")
             self._roster.admit(keys)
+            if known is None and keys.common_name == self._policy().renewals:
+                self._roster.serial += 1  # all must learn where to renew
             if known is None:
                 self._write_for_routers()
             return self._bundle(keys.common_name, hours)
@@ -240,23 +250,28 @@ class Authority:
 
     def access(self, name: str, role: Role) -> Access:
         """A node's part of the policy that was last published."""
-        policy = Policy.load(self.path / "published.toml")
+        policy = self._policy()
         control = derive(self._secret, b"", b"tutelage fleet 1")
         entries = {alias: Entry(rule, self._topic_secret(rule.topic.canonical())) for alias, rule in policy.topics.items()}
         pseudonyms = {name: record.pseudonym for name, record in self._roster.members.items()}
+        office = self._roster.members.get(policy.renewals)
         router = role == Role.ROUTER
         nodes = {name: one for name, one in pseudonyms.items() if self._roster.members[name].keys.role == Role.NODE}
         return Access(
             fleet=self.fleet,
             node=name,
-            serial=self._roster.serial,
+            serial=self._roster.serial_of(role),
             topics={} if router else {alias: entries[alias] for alias in policy.of_node(name)},
             control=Name.of_channel("notices", control),
             secret=b"" if router else control,
+            renewals=Renewals(office.pseudonym, raw(office.keys.sealing)) if office else None,
             routes=routes(entries.values(), nodes) if router else (),
             members=frozenset(nodes.values()) if router else frozenset(),
             routers=frozenset(pseudonyms.values()) - frozenset(nodes.values()) if router else frozenset(),
         )
+
+    def _policy(self) -> Policy:
+        return Policy.load(self.path / "published.toml")
 
     def _topic_secret(self, canonical: bytes) -> bytes:
         return hmac.digest(self._secret, pack(b"tutelage topic secret 1", canonical), hashlib.sha256)
@@ -289,7 +304,6 @@ class Authority:
 
     def _write_for_routers(self) -> None:
         """Routers must hear of every new or revoked member; nodes need not."""
-        self._roster.serial += 1
         for record in list(self._roster.members.values()):
             if record.keys.role == Role.ROUTER:
                 self._bundle(record.name, LEAF_HOURS)
@@ -297,7 +311,7 @@ class Authority:
     @contextmanager
     def _changing(self) -> Iterator[None]:
         """Another process may serve renewals meanwhile: read, change and write under a lock."""
-        with locked(self.path / ".lock"):
+        with self._lock:
             self._roster = Roster.load(self.path / "state.json")
             yield
             self._roster.save()

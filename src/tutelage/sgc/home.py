@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
-from tutelage.files import locked, write_atomic
+from tutelage.files import Lock, write_atomic
 from tutelage.sgc import certificates
 from tutelage.sgc.access import Access
 from tutelage.sgc.bundle import Bundle, is_bundle
@@ -69,6 +69,7 @@ class Home:
             raise KeysError(f"{path} is damaged: {error}; restore it, or revoke the node and make a new home") from None
         self.version = 0
         self._lock = threading.RLock()
+        self._files = Lock(path / ".lock")
         self._seen: tuple[object, ...] = ()
         self._trust: Trust | None = None
         self._bundle: Bundle | None = None
@@ -97,10 +98,11 @@ class Home:
             certificates.check_addresses(addresses)
         elif addresses:
             raise KeysError(f"{name} is a node, and nodes only dial out: addresses are for routers")
+        believed = None if root is None else _read_root(root)
         path.mkdir(parents=True, exist_ok=True)
         os.chmod(path, 0o700)
-        if root is not None:
-            write_atomic(path / "root.pem", _read_root(root).public_bytes(serialization.Encoding.PEM))
+        if believed is not None:
+            write_atomic(path / "root.pem", certificates.pem(believed))
         _save(path / "signing.key", Ed25519PrivateKey.generate())
         _save(path / "sealing.key", X25519PrivateKey.generate())
         content = {"format": _FORMAT, "name": name, "role": str(role), "addresses": list(addresses)}
@@ -233,7 +235,7 @@ class Home:
         Raises:
             Refused: WRONG_AUTHORITY, ROLLBACK, NOT_FOR_US, MALFORMED, EXPIRED, REVOKED; nothing is changed.
         """
-        with self._lock, locked(self.path / ".lock"):
+        with self._lock, self._files:
             self.refresh()
             if not is_bundle(notice):
                 self._accept_deny_list(notice)
@@ -286,13 +288,18 @@ class Home:
             opened, trust, member = Bundle.open(bundle.read_bytes(), self.sealing_key, trust, dated=False)
             self._bundle, self._member = opened, member
             leaf = certificates.pem(certificates.load(opened.leaf), certificates.load(opened.authority))
-            _write_if_other(self.leaf_file, leaf)
-            _write_if_other(self.root_file, certificates.pem(trust.root))
+            self._write_if_other(self.leaf_file, leaf)
+            self._write_if_other(self.root_file, certificates.pem(trust.root))
         deny = self.path / "deny"
         if trust is not None and deny.exists():
             notice = deny.read_bytes()
             trust.deny_list, self._deny = trust.read_deny_list(notice, dated=False), notice
         self._trust = trust
+
+    def _write_if_other(self, path: Path, content: bytes) -> None:
+        with self._files:
+            if not path.exists() or path.read_bytes() != content:
+                write_atomic(path, content)
 
     def _accept_deny_list(self, notice: bytes) -> None:
         new, old = self.trust.read_deny_list(notice), self.trust.deny_list
@@ -318,12 +325,6 @@ def _read_root(path: Path) -> x509.Certificate:
         raise KeysError(f"no root certificate {path}") from None
     except (OSError, ValueError) as error:
         raise KeysError(f"{path} is not a certificate: {error}") from None
-
-
-def _write_if_other(path: Path, content: bytes) -> None:
-    if not path.exists() or path.read_bytes() != content:
-        with locked(path.with_name(".files.lock")):  # a running node and `tutelage keys` see a new bundle at the same time
-            write_atomic(path, content)
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:

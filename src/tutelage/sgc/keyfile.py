@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 
-from tutelage.files import write_atomic
+from tutelage.files import Lock, write_atomic
 from tutelage.sgc.access import Entry
 from tutelage.sgc.envelope import open_sealed, seal_to
 from tutelage.sgc.epochs import Epoch, Epochs
@@ -27,6 +27,7 @@ class TopicKeys:
         epochs: its keys.
         owner: as the newest grant showed it.
         path: the file.
+        lock: to be held while it is read, changed and written.
     """
 
     def __init__(self, home: Home, entry: Entry) -> None:
@@ -34,6 +35,7 @@ class TopicKeys:
         self.exchange = Exchange(entry)
         self.epochs = Epochs()
         self.path = home.path / "keys" / entry.rule.alias
+        self.lock = Lock(self.path.with_suffix(".lock"))
         self.owner: Member | None = None
         self._sealing = home.sealing_key
         self._made_under: list[int | str] = []
@@ -74,8 +76,9 @@ class TopicKeys:
             "made_under": self._made_under,
         }
         sealed = seal_to(self._sealing.public_key(), _CONTEXT, json.dumps(content).encode())
-        write_atomic(self.path, sealed, private=True)
-        self._seen = self._stamp()
+        with self.lock:
+            write_atomic(self.path, sealed, private=True)
+            self._seen = self._stamp()
 
     def refresh(self) -> bool:
         """Read the file if another process wrote it; True if that brought keys. One that cannot be read counts as none: the

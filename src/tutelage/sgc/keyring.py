@@ -13,7 +13,6 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from tutelage.files import locked
 from tutelage.sgc.epochs import CLOCK_TOLERANCE, Epoch
 from tutelage.sgc.errors import NoKey, NotAllowed
 from tutelage.sgc.grants import NONCE_BYTES
@@ -98,6 +97,13 @@ class Keyring:
                     f"{self.home.name} has no valid key for {alias} ({why}); is its owner, {owner}, running and connected?"
                 )
             return epoch
+
+    def held(self, alias: str) -> int | None:
+        """The epoch that is on disk and valid; unlike `epoch`, an owner makes none if there is none."""
+        with self._lock:
+            keys = self._topics.get(alias) or TopicKeys(self.home, self.home.access.entry(alias))
+            epoch = keys.epochs.sealing(time.time())
+            return epoch.number if epoch is not None else None
 
     def opening(self, alias: str, number: int, now: float | None = None) -> Epoch:
         """The key of an epoch, to open a packet.
@@ -259,7 +265,7 @@ class Keyring:
 
     def _rotate(self, alias: str, now: float, *, begins: float, grace: float) -> None:
         keys = self._topics[alias]
-        with locked(keys.path.with_suffix(".lock")):
+        with keys.lock:
             # Another process of this node may have done so a moment ago.
             if keys.refresh() and keys.epochs.sealing(now) is not None and not keys.outdated(self.home):
                 return
