@@ -321,3 +321,9 @@ def test_after_a_round_trip_to_disk_a_critic_of_images_continues_bit_for_bit(tmp
     save_tree(tmp_path / "critic", critic.state_dict())
     again.load_state_dict(load_tree(tmp_path / "critic"))
     assert [critic.update() for _ in range(3)] == [again.update() for _ in range(3)]
+
+
+def test_a_step_in_which_no_robot_that_sees_moved_is_no_transition() -> None:
+    ring, none = Ring(8, (2, 2, 3), 1), np.zeros((0, 2, 2, 3), dtype=np.uint8)
+    ring.add(ring.pack(none, np.zeros((0, 1)), none, np.zeros(0, dtype=bool)))
+    assert ring.size == 0

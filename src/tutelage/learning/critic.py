@@ -84,7 +84,8 @@ class Ring:
         numbers = [np.asarray(x, dtype=np.float32) for x in (action, end[:, None])]
         if self.dtype == torch.uint8:
             numbers = [np.ascontiguousarray(x).view(np.uint8) for x in numbers]
-        parts = obs.reshape(len(obs), -1), numbers[0], next_obs.reshape(len(obs), -1), numbers[1]
+        flat = len(obs), math.prod(self.obs_shape)  # not -1: there may be no transition
+        parts = obs.reshape(flat), numbers[0], next_obs.reshape(flat), numbers[1]
         return np.concatenate(parts, axis=1, dtype=numbers[0].dtype)
 
     def add(self, rows: Array) -> None:
