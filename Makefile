@@ -49,9 +49,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-# Rendering tests need an OpenGL library without a screen. Installed where that is allowed (root and apt); elsewhere the
-# tests that need it skip and say so.
+# Rendering tests need an OpenGL library without a screen, network tests need tools for namespaces and address translation.
+# Installed where that is allowed (root and apt); elsewhere the tests that need them skip and say so.
 $(SYSTEM): $(INSTALLED)
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! $(BIN)/python -c "import ctypes; ctypes.CDLL('libEGL.so.1')" 2>/dev/null; then \
 	  apt-get update -qq && apt-get install -qq -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libosmesa6 >/dev/null; fi
+	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! { command -v ip && command -v nft; } >/dev/null; then \
+	  apt-get update -qq && apt-get install -qq -y --no-install-recommends iproute2 nftables >/dev/null; fi
 	touch $@

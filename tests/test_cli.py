@@ -218,7 +218,7 @@ def refused(said: Said) -> str:
         (["run", "Walker2d", "--bogus", "3"], "Unrecognized options: --bogus"),
         (["run", "Walker2d", "--robot", "3"], "--robots"),
         (["rnu", "Walker2d"], "rnu"),
-        ([], "{run, resume, evaluate, report, reproduce, train-expert, check, info}"),
+        ([], "{run, resume, evaluate, report, reproduce, train-expert, check, info"),
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),

@@ -10,8 +10,9 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -22,6 +23,10 @@ from tyro.conf import Positional, arg
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import ExpertConfig, RunConfig
+from tutelage.sgc.commands import keys, proxy
+from tutelage.sgc.commands.ping import ping
+from tutelage.sgc.commands.router import router
+from tutelage.sgc.commands.top import top
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -301,6 +306,11 @@ def main(args: Sequence[str] | None = None) -> None:
         "train-expert": train_expert,
         "check": check,
         "info": info,
+        "keys": keys,
+        "router": router,
+        "proxy": proxy,
+        "ping": ping,
+        "top": top,
     }
     arguments = list(sys.argv[1:] if args is None else args)
     if arguments == ["--version"]:
@@ -322,10 +332,29 @@ def main(args: Sequence[str] | None = None) -> None:
         raise SystemExit(1) from None
 
 
-def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Callable[[], None]:
-    """The call that the arguments ask for. The parser's boxes become one line, like every other error."""
+def _parse(
+    verbs: Mapping[str, Any],
+    arguments: list[str],
+    prog: str = "tutelage",
+    description: str = "Supervised autonomy for robot fleets.",
+) -> Callable[[], None]:
+    """The call that the arguments ask for. The parser's boxes become one line, like every other error.
 
-    def later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    verbs: functions, or modules with `VERBS` of their own.
+    """
+    group = verbs.get(arguments[0]) if arguments else None
+    if isinstance(group, ModuleType):
+        return _parse(group.VERBS, arguments[1:], f"{prog} {arguments[0]}", group.__doc__ or "")
+
+    def later(verb: Any) -> Callable[..., Callable[[], None]]:
+        if isinstance(verb, ModuleType):  # here for the help only
+
+            def named() -> Callable[[], None]:
+                raise AssertionError(f"{verb.__name__} is parsed above")
+
+            named.__doc__ = verb.__doc__
+            return named
+
         @functools.wraps(verb)
         def call(*args: Any, **kwargs: Any) -> Callable[[], None]:
             return functools.partial(verb, *args, **kwargs)
@@ -337,9 +366,9 @@ def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Calla
         with contextlib.redirect_stderr(said):
             chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
                 {name: later(verb) for name, verb in verbs.items()},
-                prog="tutelage",
+                prog=prog,
                 args=arguments,
-                description="Supervised autonomy for robot fleets.",
+                description=description,
             )
         return chosen
     except SystemExit as stop:
@@ -350,4 +379,4 @@ def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Calla
     meant = re.search(r"Perhaps you meant:\s+(-\S+)", " ".join(lines))
     hint = f"; did you mean {meant[1]}?" if meant else ""
     verb = f" {arguments[0]}" if arguments and arguments[0] in verbs else ""
-    raise ConfigError(f"{problem}{hint} (see tutelage{verb} --help)")
+    raise ConfigError(f"{problem}{hint} (see {prog}{verb} --help)")

@@ -21,8 +21,8 @@ def reproduce(
         tasks: which tasks; empty: those of the figure.
         seeds: root seeds; empty: the figure's own number of them.
         full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000, figure-C.1 3,000; `gates`, which
-            nobody published, 2,000 in place of 10,000; table-3.3 has 3 seeds in place of 5; the runs of both tables have
-            the published scale in any case.
+            nobody published, 2,000 in place of 10,000; table-3.3 has 3 seeds and trains its networks on instead of anew;
+            table-3.1 has the published scale in any case.
         workers: runs side by side.
         out: folder of the run folders.
         results: folder of the small result files; the experiment has its own folder in it.
@@ -48,7 +48,7 @@ def reproduce(
         given.pop("tasks", None)
         if not full:
             given.setdefault("seeds", tuple(range(table_3.SETTINGS[what].seeds)))
-        return table_3.reproduce(table_3.Table3Config(what, **given))
+        return table_3.reproduce(table_3.Table3Config(what, full=full, **given))
     ablations = what == "figure-C.1"
     small, evaluate = (3000, 0) if ablations else (2000, 1000)
     for task in tasks or (("Walker2d",) if ablations else ("Walker2d", "Ant", "Humanoid")):

@@ -67,7 +67,7 @@ class Setting:
         first: episodes of the cloned policy alone, for the first thresholds and critic data.
         tests, aided: test episodes without and with help.
         learner: of all but behaviour cloning. critic: of ThriftyDAgger.
-        seeds: how many runs of each algorithm take less than an hour on four cores.
+        small_learner, small_critic: those that take less than an hour on four cores; likewise seeds: 0 to so many.
         published: the rows as printed: interventions, human and robot actions of a training episode, successes without
             help, then interventions and actions of a successful test episode with help, and successes with it.
     """
@@ -83,20 +83,30 @@ class Setting:
     aided: int
     learner: LearnerConfig
     critic: CriticConfig
+    small_learner: LearnerConfig
+    small_critic: CriticConfig
     seeds: int
     published: dict[str, str]
 
 
+_PEG = (
+    LearnerConfig("scratch", every=2000, gradient_steps=2500, batch=100, learning_rate=1e-3, pretrain=2500),
+    CriticConfig(gamma=0.9999, learning_rate=1e-3, batch=50, positives=0.1, every=1),
+)
+_CABLE = (
+    LearnerConfig("scratch", every=500, gradient_steps=1500, batch=64, learning_rate=2.5e-4, pretrain=1500),
+    CriticConfig(gamma=0.9999, learning_rate=2.5e-4, batch=64, positives=0.1, every=1),
+)
+_CABLE_SMALL = (  # a gradient step of five networks that see takes 0.2 s of a core: updates go on with the weights there are
+    LearnerConfig("step", every=500, gradient_steps=500, batch=64, learning_rate=2.5e-4, pretrain=1500),
+    CriticConfig(gamma=0.9999, learning_rate=2.5e-4, batch=64, positives=0.1, every=2, pretrain=1000),
+)
 SETTINGS = {
     "table-3.1": Setting(
-        "PegInsertion", "state", 5, 10_000, 2687, 4004, 10, 100, 20,
-        LearnerConfig("scratch", every=2000, gradient_steps=2500, batch=100, learning_rate=1e-3, pretrain=2500),
-        CriticConfig(gamma=0.9999, learning_rate=1e-3, batch=50, positives=0.1, every=1), 5, PUBLISHED_3_1,
+        "PegInsertion", "state", 5, 10_000, 2687, 4004, 10, 100, 20, *_PEG, *_PEG, 5, PUBLISHED_3_1
     ),
     "table-3.3": Setting(
-        "CableRouting", "images", 2, 1500, 1381, 1381, 5, 100, 15,
-        LearnerConfig("scratch", every=500, gradient_steps=1500, batch=64, learning_rate=2.5e-4, pretrain=1500),
-        CriticConfig(gamma=0.9999, learning_rate=2.5e-4, batch=64, positives=0.1, every=1), 3, PUBLISHED_3_3,
+        "CableRouting", "images", 2, 1500, 1381, 1381, 5, 100, 15, *_CABLE, *_CABLE_SMALL, 3, PUBLISHED_3_3
     ),
 }  # fmt: skip
 
@@ -108,6 +118,8 @@ class Table3Config:
     Attributes:
         table: "table-3.1" or "table-3.3".
         seeds: root seeds.
+        full: the published scale, which table-3.1 has in any case. Else the networks of table-3.3 are trained on from the
+            weights that they have, not anew.
         steps: timesteps of a run; default: the published number.
         workers: runs side by side, one core each.
         out: folder of the run folders.
@@ -116,6 +128,7 @@ class Table3Config:
 
     table: str = "table-3.1"
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    full: bool = False
     steps: int | None = None
     workers: int = 4
     out: Path = Path("runs/table-3.1")
@@ -128,7 +141,7 @@ class Table3Config:
             raise ConfigError(f"{self.table} needs seeds, steps and workers; got {self.seeds}, {self.steps}, {self.workers}")
 
 
-def configuration(setting: Setting, algorithm: str, steps: int | None = None) -> RunConfig:
+def configuration(setting: Setting, algorithm: str, full: bool = True, steps: int | None = None) -> RunConfig:
     """The run of an algorithm, without seed and folder."""
     largest = 4.0 * setting.actions  # thresholds of B.2 are squared distances, ours fractions of the largest one
     gate = {
@@ -138,12 +151,14 @@ def configuration(setting: Setting, algorithm: str, steps: int | None = None) ->
         NO_NOVELTY: GateConfig(without="novelty"),
         NO_RISK: GateConfig(without="risk"),
     }.get(algorithm, GateConfig(alpha=0.01))
-    learner = dataclasses.replace(setting.learner, schedule="never") if algorithm == BC else setting.learner
+    learner, critic = (setting.learner, setting.critic) if full else (setting.small_learner, setting.small_critic)
+    if algorithm == BC:
+        learner = dataclasses.replace(learner, schedule="never")
     return RunConfig(
         setting.task, {BC: "C.", SAFE: SAFE, LAZY: LAZY, HG: HG}.get(algorithm, THRIFTY),
         robots=1, humans=1, steps=steps or setting.steps, t_teleop=1, t_reset=1,
         observation=setting.observation, offline_pairs=setting.more_pairs if algorithm == BC else setting.pairs,
-        calibration_steps=setting.first * TASKS[setting.task].horizon, gate=gate, learner=learner, critic=setting.critic,
+        calibration_steps=setting.first * TASKS[setting.task].horizon, gate=gate, learner=learner, critic=critic,
         threads=1, torch_threads=1, checkpoint_every=min(1000, setting.learner.every), metrics_every=1000, record="none",
         label=algorithm,
     )  # fmt: skip
@@ -216,12 +231,14 @@ def reproduce(config: Table3Config) -> str:
     Raises:
         TutelageError: a run failed.
     """
-    setting = SETTINGS[config.table]
-    jobs = []
+    setting, jobs = SETTINGS[config.table], []
+    place = config.out / "full" if config.full else config.out
     for algorithm in reversed(setting.published):
         for seed in config.seeds:
             name = f"{slug(algorithm)}-s{seed}"
-            run = dataclasses.replace(configuration(setting, algorithm, config.steps), seed=seed, out=config.out / name)
+            run = dataclasses.replace(
+                configuration(setting, algorithm, config.full, config.steps), seed=seed, out=place / name
+            )
             arguments = run, setting.tests, setting.aided
             jobs.append(Job(f"{algorithm} seed {seed}", one, arguments, config.results / f"{name}.json", _summary))
     return table(config.table, run_jobs(jobs, config.workers))
@@ -236,8 +253,8 @@ def table(name: str, results: list[dict[str, Any]]) -> str:
     """Published and ours side by side, as Markdown."""
     seeds, steps = {r["seed"] for r in results}, int(results[0]["metrics"]["t"])
     lines = [
-        f"{name.replace('t', 'T', 1).replace('-', ' ')}: {steps:,} timesteps, {len(seeds)} seeds. Mean ± standard deviation "
-        "over episodes; our successes are the mean over seeds ± 95 % interval.",
+        f"{name.replace('t', 'T', 1).replace('-', ' ')}, {_scale(name, results)}: {steps:,} timesteps, {len(seeds)} seeds. "
+        "Mean ± standard deviation over episodes; our successes are the mean over seeds ± 95 % interval.",
         "",
         "| Algorithm | | Ints | Acts (H) | Acts (R) | Alone ↑ | Ints, execution | Acts (H) | Acts (R) | With help ↑ |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
@@ -251,6 +268,12 @@ def table(name: str, results: list[dict[str, Any]]) -> str:
         if rates := [r["request_rate"] for r in results if r["algorithm"] == name]:
             lines.append(f"| {name} | {np.mean(rates):.4f} |")
     return "\n".join(lines) + "\n"
+
+
+def _scale(name: str, results: list[dict[str, Any]]) -> str:
+    learner = next((r["config"]["learner"] for r in results if r["algorithm"] != BC), None)
+    published = learner is None or learner["schedule"] == SETTINGS[name].learner.schedule
+    return "published scale" if published else "small scale"
 
 
 def _rate(results: list[dict[str, Any]], name: str) -> str:
