@@ -17,6 +17,8 @@ from tutelage.experiments.config import RunConfig
 from tutelage.fleet.modes import INVALID, TABLE, Event, Mode
 from tutelage.fleet.priority import TERMS
 from tutelage.learning.critic import CriticConfig
+from tutelage.policies.networks import hidden_layers
+from tutelage.policies.vision import HEAD
 from tutelage.sgc.commands import keys, proxy
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -213,7 +215,7 @@ def test_every_term_of_a_priority_is_documented() -> None:
 
 def test_the_numbers_of_the_algorithms_are_the_defaults() -> None:
     page = re.sub(r"\s+", " ", (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8"))
-    run, critic = RunConfig("Walker2d"), CriticConfig()
+    run, critic, hidden = RunConfig("Walker2d"), CriticConfig(), hidden_layers(17, None)
     periods = {task.initial_period for task in TASKS.values() if task.name != "Humanoid"}
     assert len(periods) == 1
     for said in (
@@ -224,7 +226,8 @@ def test_the_numbers_of_the_algorithms_are_the_defaults() -> None:
         f"({critic.pretrain:,} gradient steps, a quarter of each batch violations)",
         f"discount is {critic.gamma} and their target moves by {critic.tau} a gradient step",
         f"updated every {critic.every} timesteps",
-        f"an ensemble of {run.members} networks ({len(run.hidden)} × {run.hidden[0]} ReLU",
+        f"an ensemble of {run.members} networks ({len(hidden)} × {hidden[0]} ReLU",
+        f"then fully connected layers of {', '.join(map(str, HEAD[:-1]))} and {HEAD[-1]}",
         f"| offline pairs | {MujocoTask.offline_pairs:,}, but {TASKS['Ant'].offline_pairs} for Ant;",
         f"| gradient steps before the run | {run.learner.pretrain:,} |",
         f"| gradient steps a timestep | {run.learner.gradient_steps}, of {run.learner.batch} pairs a member |",
