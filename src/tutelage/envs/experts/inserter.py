@@ -62,7 +62,9 @@ class Inserter(ABC):
     """From the middle of the ring to where its handle is gripped, m."""
     handle_width: ClassVar[float]
     above_handle: ClassVar[float] = 0.0
-    """How high the grip is above the middle of the handle when it grips, m."""
+    """How high the grip should be above the middle of the handle when the fingers shut, m."""
+    low_enough: ClassVar[float] = CLOSE
+    """How near to that height is near enough, m."""
     lowest: ClassVar[float]
     """The grip does not get lower than this, m."""
     opened: ClassVar[float]
@@ -123,7 +125,7 @@ class Inserter(ABC):
         """Grip the handle at a point: where to move, (N, 3), m, and whether to shut the fingers, (N,)."""
         there = (np.linalg.norm((point - s.grip)[:, :2], axis=1) < CLOSE) & (np.abs(turn) < STRAIGHT)
         move = self._approach(s.grip, point, there, s.finger > 0.8 * self.opened)
-        return move, there & (np.abs(point - s.grip)[:, 2] < CLOSE)
+        return move, there & (np.abs(point - s.grip)[:, 2] < self.low_enough)
 
     def _drag(self, s: Scene) -> tuple[Array, Mask]:
         """Put shut fingers into the hole and move away from the peg: likewise."""
