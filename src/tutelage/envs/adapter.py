@@ -64,7 +64,7 @@ class Backend(ABC):
     can_pause: bool = True
     """False: robots that are not stepped may go on by themselves; nobody looks at them until they are reset."""
     can_checkpoint: bool = False
-    """Whether `state_dict` works."""
+    """Whether it has `state_dict` and `load_state_dict`."""
 
     @abstractmethod
     def reset(self, robots: Mask, seed: int | None) -> Array:
@@ -84,11 +84,11 @@ class Backend(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything of the simulator that is needed to continue bit for bit."""
-        raise ConfigError("this fleet cannot be checkpointed: its simulator does not give out its state")
+        raise NotImplementedError
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        raise ConfigError("this fleet cannot be checkpointed: its simulator does not take a state")
+        raise NotImplementedError
 
     @abstractmethod
     def close(self) -> None:
@@ -213,6 +213,8 @@ class AdaptedFleet(Fleet):
         self._backend.close()
 
     def state_dict(self) -> dict[str, Any]:
+        if not self.can_checkpoint:
+            raise ConfigError("this fleet cannot be checkpointed: its simulator does not give out its state")
         return {
             "backend": self._backend.state_dict(),
             "obs": self._obs.copy(),
@@ -223,6 +225,8 @@ class AdaptedFleet(Fleet):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        if not self.can_checkpoint:
+            raise ConfigError("this fleet cannot be checkpointed: its simulator does not take a state")
         self._backend.load_state_dict(state["backend"])
         self._obs = state["obs"].copy()
         self._elapsed, self._return = state["elapsed"].copy(), state["return"].copy()

@@ -39,8 +39,8 @@ def make_fleet(
     """A fleet of `num_envs` robots.
 
     Args:
-        task: a built-in task ("Walker2d"), one on an extra ("NutAssemblyRound"), the name of an entry point of the group "tutelage.tasks", or
-            "module:callable". The callable is a subclass of `MujocoTask`, or is called as
+        task: a built-in task ("Walker2d"), one on an extra ("NutAssemblyRound"), the name of an entry point of the group
+            "tutelage.tasks", or "module:callable". The callable is a subclass of `MujocoTask`, or is called as
             `callable(num_envs, **kwargs)` and returns a `Fleet`.
         num_envs: N robots.
         disturbance: for the MuJoCo tasks, see `MujocoFleet`. Handed to a callable only when given, like `threads`.

@@ -63,16 +63,16 @@ class NutAssemblyRound(AdaptedFleet):
     """N UR5e arms that put a round nut over a peg; see `Fleet` for the contract.
 
     Observations: position (3, m) and quaternion (4, x y z w) of the nut, both likewise as the gripper sees them, cosine (6),
-    sine (6) and velocity (6, rad/s) of the arm's joints, position (3, m) and quaternion (4) of the gripper, angles (6, rad) and
-    velocities (6, rad/s) of its joints.
+    sine (6) and velocity (6, rad/s) of the arm's joints, position (3, m) and quaternion (4) of the gripper, angles (6, rad)
+    and velocities (6, rad/s) of its joints.
 
-    Actions: the wished step along x, y and z, the turn around z, each as a fraction of what robosuite's controller takes (5 cm,
-    0.5 rad; in the twentieth of a second that it is given, the arm gets about 1.2 cm and 0.1 rad far), and above 0 "shut", else
-    "open". robosuite executes it in one step of its controller (operational space control with fixed impedance, 20 Hz); in the
-    rest of the decision the arm holds still and the fingers go on.
+    Actions: the wished step along x, y and z and the turn around z, each as a fraction of what robosuite's controller takes
+    (5 cm, 0.5 rad; in the twentieth of a second that it is given, the arm gets about 1.2 cm and 0.1 rad far), and above 0
+    "shut", else "open". robosuite executes it in one step of its controller (operational space control with fixed impedance,
+    20 Hz); in the rest of the decision the arm holds still and the fingers go on.
 
-    Goal: robosuite's own. The nut is within 3 cm of the peg along x and y, lower than 5 cm above the table, and more than 4.2 cm
-    from the grip. Violation: the nut is no longer over the table, which robosuite knows nothing of.
+    Goal: robosuite's own. The nut is within 3 cm of the peg along x and y, lower than 5 cm above the table, and more than
+    4.2 cm from the grip. Violation: the nut is no longer over the table, which robosuite knows nothing of.
 
     Args:
         num_envs: N robots. They take turns in the thread that calls `step_wait`.
@@ -188,14 +188,14 @@ class _Robosuite(Backend):
         seen = self._env._get_observations(force_update=True)
         return np.concatenate([seen[name] for name in OBSERVED])
 
-    def _enter(self, robot: int) -> None:
+    def _enter(self, robot: int | np.intp) -> None:
         mujoco.mj_setState(self._model, self._data, self._physics[robot], _STATE)
         self._controller.initial_joint = self._posture[robot].copy()
         self._gripper.current_action = self._fingers[robot].copy()
         for controller in self._env.robots[0].part_controllers.values():
             controller.new_update = True  # what it noted of the robot before is another robot's
 
-    def _leave(self, robot: int) -> None:
+    def _leave(self, robot: int | np.intp) -> None:
         mujoco.mj_getState(self._model, self._data, self._physics[robot], _STATE)
         self._posture[robot], self._fingers[robot] = self._controller.initial_joint, self._gripper.current_action
 

@@ -1,7 +1,8 @@
 """The shipped controllers that act as algorithmic supervisors, and what each scored.
 
-A controller is a file of trained weights, or a program that the task names (its attribute `expert`). One with weights is called
-an expert only if its mean return reaches the published expert's (see `PUBLISHED`). The scores of a program are measured by
+A controller is a file of trained weights, or a program that the task names (its attribute `expert`). One with weights is
+called an expert only if its mean return reaches the published expert's (see `PUBLISHED`). The scores of a program are
+measured by
 
     python -m tutelage.envs.experts.score PegInsertion
 """
