@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
 DEMO := runs/demo
 
-.PHONY: demo test lint docs examples results bench clean help
+.PHONY: demo test robosuite lint docs examples results bench clean help
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -19,6 +19,13 @@ demo: $(INSTALLED) ## 100 robots, 10 humans: C.U.R. against behaviour cloning, s
 
 test: $(INSTALLED) $(SYSTEM) ## all tests
 	$(BIN)/pytest -n auto --dist loadfile
+
+# robosuite needs numpy 1, so it has an environment of its own.
+robosuite: ## tests of the extra robosuite
+	$(PYTHON) -m venv .venv-robosuite
+	.venv-robosuite/bin/pip install -q --disable-pip-version-check "$$(grep ^torch== constraints-robosuite.txt)"
+	.venv-robosuite/bin/pip install -q --disable-pip-version-check -c constraints-robosuite.txt -e '.[robosuite]' pytest hypothesis
+	.venv-robosuite/bin/pytest tests/envs/test_robosuite_fleet.py
 
 lint: $(INSTALLED) ## ruff, mypy, import contracts
 	$(BIN)/ruff check .
@@ -41,7 +48,7 @@ bench: $(INSTALLED) ## the speed claims, as ratios on this machine
 	$(BIN)/python -m benchmarks
 
 clean: ## remove the environment and the demo's runs
-	rm -rf $(VENV) $(DEMO) site
+	rm -rf $(VENV) .venv-robosuite $(DEMO) site
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

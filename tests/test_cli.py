@@ -245,7 +245,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (
             ["run", "Walkr2d"],
             "unknown task 'Walkr2d' (did you mean Walker2d?); tasks: HalfCheetah, Walker2d, Ant, Humanoid, PegInsertion, CableRouting, "
-            "or your own as module:callable",
+            "NutAssemblyRound, or your own as module:callable",
         ),
         (["run", "nowhere:make"], "task 'nowhere:make': no module 'nowhere'; install it, or run where Python finds it"),
         (

@@ -181,7 +181,7 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
     if config.disturbance is None and task:
         changes["disturbance"] = task.disturbance
     if config.offline_pairs is None:
-        changes["offline_pairs"] = (task or MujocoTask).offline_pairs
+        changes["offline_pairs"] = getattr(found, "offline_pairs", MujocoTask.offline_pairs)
     if t.initial is None:
         initial = task.initial_period if task and config.priority.strip(".") == "C.U.R" else 0
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
