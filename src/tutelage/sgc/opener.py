@@ -131,11 +131,8 @@ class Opener:
             Refused: no answer to an offer of ours, or not from a node that may send. Counted.
         """
         with self._lock:
-            try:
+            with self.refusals.counting():
                 sender, salt, session = self._handshake.complete(answer)
-            except Refused as refused:
-                self.refusals.add(refused.reason)
-                raise
             self._sessions[sender, salt, session.ident] = session
             while len(self._sessions) > _MAX_SESSIONS:
                 self._sessions.popitem(last=False)

@@ -152,11 +152,8 @@ class Sealer:
         if self._authenticity != Authenticity.SESSION:
             raise NotAllowed(f'{self.alias} has authenticity "{self._authenticity}" in the policy, so it has no sessions')
         with self._lock:
-            try:
+            with self.refusals.counting():
                 answer, session = self._handshake.answer(offer, self._sender, self.salt)
-            except Refused as refused:
-                self.refusals.add(refused.reason)
-                raise
             same = [one for one in self._sessions if one.member.pseudonym == session.member.pseudonym]
             kept = [one for one in self._sessions if one not in same[:-1]]
             self._sessions = [*kept, session][-MAX_SESSIONS:]
