@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.timing import machine
 
-NAMES = ("loop", "allocation", "engine", "gates", "memory")
+NAMES = ("loop", "allocation", "engine", "gates", "memory", "connectivity")
 
 
 def main() -> None:
