@@ -253,7 +253,8 @@ class Publisher:
 
     def _hand_over(self, first: int, packet: bytes | bytearray) -> None:
         if not self._lossy:
-            self._history.add(first, self._sealer.sequence, packet, time.monotonic())
+            last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
+            self._history.add(min(first, last), last, packet, time.monotonic())
         self.packets += 1
         self._transport.publish(self._key, packet, reliable=not self._lossy)
 
