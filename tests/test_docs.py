@@ -17,12 +17,14 @@ from tutelage.experiments.config import RunConfig
 from tutelage.fleet.modes import INVALID, TABLE, Event, Mode
 from tutelage.fleet.priority import TERMS
 from tutelage.learning.critic import CriticConfig
+from tutelage.sgc.commands import keys, proxy
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "results").glob("*.md")],
 )
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+GROUPS = {"keys": keys, "proxy": proxy}
 GENERATED = {"runs", "site", "dist"}
 
 
@@ -100,13 +102,13 @@ def test_pages_of_the_site_link_to_nothing_outside_of_it() -> None:
 
 @cache
 def manual(verb: str) -> str | None:
-    """What `tutelage VERB --help` prints; None: there is no such verb."""
+    """What `tutelage VERB --help` prints; None: there is no such verb. Of a group, the verb is two words: "keys init"."""
     import io
     from contextlib import redirect_stderr, redirect_stdout
 
     out = io.StringIO()
     with redirect_stdout(out), redirect_stderr(out), pytest.raises(SystemExit) as end:
-        main([verb, "--help"])
+        main([*verb.split(), "--help"])
     return None if end.value.code else out.getvalue()
 
 
@@ -122,6 +124,8 @@ def commands(page: Path) -> list[str]:
 def test_commands_and_their_options_exist(page: Path) -> None:
     for command in commands(page):
         verb, *words = command.partition("  #")[0].split()
+        if words and verb in GROUPS:
+            verb = f"{verb} {words.pop(0)}"
         text = manual(verb)
         assert text is not None, f"tutelage {command}: no such verb"
         for option in (word.partition("=")[0] for word in words if word.startswith("--")):
@@ -132,7 +136,9 @@ def test_commands_and_their_options_exist(page: Path) -> None:
 def test_options_in_code_spans_exist(page: Path) -> None:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     own = {"--check", "--write", "--strict", "--seeds", "--ablations"}  # of tables, run_examples, mypy, study
-    known = "".join(filter(None, map(manual, ("run", "evaluate", "report", "reproduce", "train-expert", "check"))))
+    verbs = ["run", "evaluate", "report", "reproduce", "train-expert", "check"]
+    verbs += [f"{group} {verb}" for group, module in GROUPS.items() for verb in module.VERBS]
+    known = "".join(filter(None, map(manual, verbs)))
     for option in set(re.findall(r"`(--[a-z][\w.-]*)", text)) - own:
         assert option in known, f"no verb has {option}"
 

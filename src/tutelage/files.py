@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator
+import threading
 from pathlib import Path
 
 from tutelage.errors import TutelageError
@@ -25,8 +25,8 @@ def write_atomic(path: Path, content: bytes, *, private: bool = False) -> None:
         if private:
             with contextlib.suppress(FileNotFoundError):
                 beside.unlink()  # one that a crash left may be readable by others
-        mode = 0o600 if private else 0o666
-        with open(beside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            os.close(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+        with open(beside, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -37,9 +37,29 @@ def write_atomic(path: Path, content: bytes, *, private: bool = False) -> None:
         raise TutelageError(f"cannot write {path}: {error.strerror}; free some space or choose another folder") from None
 
 
-@contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Hold the lock file `path` (made if absent) against other processes and threads that do the same."""
-    with open(path, "ab", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+class Lock:
+    """A lock between processes and threads: whoever holds the file's lock. The thread that holds it may enter again."""
+
+    def __init__(self, path: Path) -> None:
+        """path: the lock file, made if absent; its folder must exist when the lock is entered."""
+        self._path = path
+        self._threads = threading.RLock()
+        self._depth = 0
+        self._file = -1
+
+    def __enter__(self) -> None:
+        self._threads.acquire()
+        try:
+            if self._depth == 0:
+                self._file = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600)
+                fcntl.flock(self._file, fcntl.LOCK_EX)
+            self._depth += 1
+        except OSError as error:
+            self._threads.release()
+            raise TutelageError(f"cannot lock {self._path}: {error.strerror}") from None
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            os.close(self._file)
+        self._threads.release()

@@ -149,7 +149,7 @@ def test_a_flood_of_invented_senders_takes_no_memory(fleet: Fleet) -> None:
         with pytest.raises(Refused):
             opener.open(packet[:12] + dice.randbytes(32) + packet[44:])
     assert opener.refusals[Reason.TAMPERED] == COUNT
-    assert (len(opener._ciphers), len(opener._members), len(opener._replay._senders)) == (0, 0, 0)
+    assert (len(opener._streams), len(opener._members), len(opener._replay._senders)) == (0, 0, 0)
 
 
 def member_forger(fleet: Fleet, alias: str, victim: str, genuine: Sealer, by: str) -> Sealer:
@@ -214,11 +214,11 @@ def test_a_signed_message_cannot_be_sealed_again_for_another_place(fleet: Fleet)
     fields = read_header(memoryview(packet), packet[1])
     cipher = sealer._cipher  # members can derive it
     assert cipher is not None
-    signature = cipher.decrypt(nonce(PROOF, fields.first), packet[-80:], packet[:HEADER])
+    signature = cipher.decrypt(nonce(PROOF, packet), packet[-80:], packet[:HEADER])
     again = fields._replace(first=fields.first + 1).pack()
-    body = cipher.encrypt(nonce(BODY, fields.first + 1), b"go", again)
+    body = cipher.encrypt(nonce(BODY, again), b"go", again)
     with pytest.raises(Refused) as raised:
-        opener.open(again + body + cipher.encrypt(nonce(PROOF, fields.first + 1), signature, again))
+        opener.open(again + body + cipher.encrypt(nonce(PROOF, again), signature, again))
     assert raised.value.reason == Reason.FORGED
 
 

@@ -20,7 +20,8 @@ def take(
     replay: Replay, first: int, count: int = 1, *, sender: bytes = A, salt: bytes = SALT, sent: int = START
 ) -> Reason | None:
     try:
-        replay.admit(sender, salt, first, count, sent, START)
+        replay.check_time(sent, START)
+        replay.admit(sender, salt, first, count, sent)
     except Refused as refused:
         return refused.reason
     return None
@@ -57,7 +58,7 @@ def test_messages_come_once_in_any_order_within_the_window() -> None:
 def test_asking_remembers_nothing() -> None:
     replay = Replay(None, START)
     for _ in range(3):
-        replay.check(A, SALT, 1, 1, START, START)
+        replay.check(A, SALT, 1, START, START)
     assert take(replay, 1) is None
 
 

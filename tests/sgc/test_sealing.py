@@ -294,11 +294,11 @@ def test_a_message_that_is_too_old_is_refused(fleet: Fleet) -> None:
 
 
 def test_what_a_receiver_remembers_is_bounded_whatever_is_sent(fleet: Fleet, monkeypatch) -> None:
-    monkeypatch.setattr(opener_module, "_MAX_CIPHERS", 4)
+    monkeypatch.setattr(opener_module, "_MAX_STREAMS", 4)
     opener = fleet.opener("server", "camera")
     for _ in range(20):
         opener.open(fleet.sealer("drone-1", "camera").seal(b"x"))
-    assert len(opener._ciphers) == 4
+    assert len(opener._streams) == 4
     assert len(opener._members) == 1
 
 

@@ -14,7 +14,7 @@ from tutelage.sgc.names import SECRET_BYTES, Name
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import Authenticity, Delivery, Kind, Lane, Role, TopicRule
 
-__all__ = ["Access", "Authenticity", "Delivery", "Entry", "Kind", "Lane", "Role", "Route", "TopicRule"]
+__all__ = ["Access", "Authenticity", "Delivery", "Entry", "Kind", "Lane", "Renewals", "Role", "Route", "TopicRule"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,19 @@ class Route:
 
 
 @dataclass(frozen=True)
+class Renewals:
+    """The node that renews certificates over the network.
+
+    Attributes:
+        pseudonym: its own.
+        sealing: its X25519 public key, 32 bytes; requests are sealed to it.
+    """
+
+    pseudonym: str
+    sealing: bytes
+
+
+@dataclass(frozen=True)
 class Access:
     """The part of the policy that one node is told, signed by the fleet's authority and sealed to the node.
 
@@ -61,6 +74,7 @@ class Access:
         control: name of the fleet's own channel, for notices such as the deny list; all members know it.
         secret: 32 bytes that all nodes of the fleet know and no router does; hides names of nodes on the control channel.
             Empty for routers.
+        renewals: who renews certificates over the network; None if nobody does.
         routes: for routers only.
         members: for routers only: pseudonyms of all nodes that are not revoked.
         routers: for routers only: pseudonyms of all routers that are not revoked.
@@ -72,6 +86,7 @@ class Access:
     topics: Mapping[str, Entry]
     control: Name
     secret: bytes = field(default=b"", repr=False)
+    renewals: Renewals | None = None
     routes: tuple[Route, ...] = ()
     members: frozenset[str] = frozenset()
     routers: frozenset[str] = frozenset()
@@ -123,6 +138,7 @@ class Access:
             "topics": {
                 alias: {"rule": entry.rule.to_table(), "secret": entry.secret.hex()} for alias, entry in self.topics.items()
             },
+            "renewals": [self.renewals.pseudonym, self.renewals.sealing.hex()] if self.renewals else [],
             "routes": [
                 [route.name.hex(), route.kind, route.owner, sorted(route.send), sorted(route.receive)]
                 for route in self.routes
@@ -149,6 +165,7 @@ class Access:
                 Route(Name(bytes.fromhex(name)), Kind(kind), str(owner), frozenset(send), frozenset(receive))
                 for name, kind, owner, send, receive in content["routes"]
             )
+            renewals = content["renewals"]
             return cls(
                 fleet=str(content["fleet"]),
                 node=str(content["node"]),
@@ -156,11 +173,12 @@ class Access:
                 topics=topics,
                 control=Name(bytes.fromhex(content["control"])),
                 secret=bytes.fromhex(content["secret"]),
+                renewals=Renewals(str(renewals[0]), bytes.fromhex(renewals[1])) if renewals else None,
                 routes=routes,
                 members=frozenset(content["members"]),
                 routers=frozenset(content["routers"]),
             )
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, ConfigError) as error:
+        except (LookupError, ValueError, TypeError, AttributeError, RecursionError, ConfigError) as error:
             raise Refused(Reason.MALFORMED, f"not a part of a policy: {error}") from None
 
 

@@ -45,17 +45,24 @@ _Grants = dict[str, dict[tuple[str, str], list[str]]]  # pseudonym -> (flow, mes
 
 
 def access_control(
-    routes: Iterable[Route], members: Set[str], routers: Set[str], control: Name, denied: Set[str] = frozenset()
+    routes: Iterable[Route],
+    members: Set[str],
+    routers: Set[str],
+    control: Name,
+    denied: Set[str] = frozenset(),
+    office: str = "",
 ) -> dict[str, Any]:
     """The tree that Zenoh's configuration calls `access_control`.
 
     members: pseudonyms of all nodes. routers: of the other routers, who may pass on anything. denied: revoked, of any kind.
+    office: the node that renews certificates, "" if nobody does.
     """
     grants: _Grants = defaultdict(lambda: defaultdict(list))
     for route in routes:
         _of_route(grants, route)
     for who in members:
         _allow(grants, {who}, (*PUBLISH, *SUBSCRIBE), lanes.key(control, lanes.DENY))
+        _allow(grants, {who}, SERVE if who == office else ASK, lanes.key(control, lanes.RENEW))
     rules, subjects, policies = [], [], []
     for who in sorted(set(grants) - denied):
         allowed = grants[who]

@@ -26,43 +26,28 @@ from dataclasses import replace
 from pathlib import Path
 
 from cryptography import x509
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from tutelage.files import locked, write_atomic
+from tutelage.files import Lock, write_atomic
 from tutelage.sgc import certificates
-from tutelage.sgc.access import Access, Entry
+from tutelage.sgc.access import Access, Entry, Renewals
 from tutelage.sgc.bundle import Bundle
 from tutelage.sgc.certificates import raw
 from tutelage.sgc.envelope import derive
 from tutelage.sgc.errors import KeysError
 from tutelage.sgc.names import SECRET_BYTES, Name
-from tutelage.sgc.policy import Policy, routes
+from tutelage.sgc.policy import TEMPLATE, Policy, routes
+from tutelage.sgc.privatekeys import load_signing_key, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.roster import Roster
 from tutelage.sgc.rules import NODE_NAME, Role
 from tutelage.sgc.signed import sign
-from tutelage.sgc.trust import DENY_LIST, MEMBERSHIP, membership
+from tutelage.sgc.trust import DENY_LIST, MEMBERSHIP, fingerprint, membership
 from tutelage.sgc.wire import pack
 
 LEAF_HOURS = 24.0
 AUTHORITY_DAYS = 366.0
 ROOT_DAYS = 3660.0
-POLICY = """version = 1
-
-# Who may say and hear what. Without a table here nobody may do anything. After a change: tutelage keys issue --policy
-#
-# [topics.camera]
-# node = "drone-1"                  # metadata: its 256-bit name is made from it
-# interface = "/camera"
-# type = "sensor_msgs/msg/Image"
-# owner = "drone-1"                 # the node that hands out the topic's keys
-# publish = ["drone-1"]
-# subscribe = ["server", "operator-*"]
-# authenticity = "signature"        # or "session", "chain"
-# delivery = "lossy"                # or "reliable"
-# max_age = 0.5                     # seconds; commands should have one
-"""
 
 
 class Authority:
@@ -71,10 +56,11 @@ class Authority:
     def __init__(self, path: Path) -> None:
         """Use `Authority.open`."""
         self.path = path
+        self._lock = Lock(path / ".lock")
         try:
             self._roster = Roster.load(path / "state.json")
             self._secret = (path / "names.secret").read_bytes()
-            self._key = _load(path / "ca.key", None)
+            self._key = load_signing_key(path / "ca.key")
             self._certificate = x509.load_pem_x509_certificate((path / "ca.pem").read_bytes())
             self._root = x509.load_pem_x509_certificate((path / "root.pem").read_bytes())
             if len(self._secret) != SECRET_BYTES:
@@ -105,12 +91,12 @@ class Authority:
         root_key = Ed25519PrivateKey.generate()
         public, now = root_key.public_key(), time.time()
         root = certificates.authority_certificate(f"{fleet} root", public, None, root_key, now, ROOT_DAYS)
-        _save(path / "root" / "root.key", root_key, passphrase)
+        save_key(path / "root" / "root.key", root_key, passphrase)
         os.chmod(path / "root", 0o700)
         write_atomic(path / "root.pem", certificates.pem(root))
         write_atomic(path / "names.secret", secrets.token_bytes(SECRET_BYTES), private=True)
-        write_atomic(path / "policy.toml", POLICY.encode())
-        write_atomic(path / "published.toml", POLICY.encode())
+        write_atomic(path / "policy.toml", TEMPLATE.encode())
+        write_atomic(path / "published.toml", TEMPLATE.encode())
         _certify(path, fleet, root, root_key)
         Roster(path / "state.json", fleet).save()
         return cls(path)
@@ -144,17 +130,24 @@ class Authority:
         """Members, revoked pseudonyms, serials. To be read only."""
         return self._roster
 
-    def renew_own(self, root_key: Path | None = None, passphrase: bytes | None = None) -> None:
+    def refresh(self) -> None:
+        """Read again what another process changed."""
+        with self._lock:
+            self._roster = Roster.load(self.path / "state.json")
+
+    def renew_own(self, root_key: Path | None = None, passphrase: bytes | None = None, *, revoke_old: bool = False) -> None:
         """A new key and certificate for the authority itself; leaves that the old one signed stay valid until they expire.
 
         root_key: default: root/root.key in the folder.
+        revoke_old: the old key was stolen: whatever it signed is refused from now on, leaves of all nodes included; new
+            bundles for all are in outbox/.
 
         Raises:
             KeysError: no such key, not this fleet's, or the passphrase does not fit.
         """
         path = root_key or self.path / "root" / "root.key"
         try:
-            key = _load(path, passphrase)
+            key = load_signing_key(path, passphrase)
         except FileNotFoundError:
             raise KeysError(
                 f"no root key {path}; bring the medium that holds it, and name the file with --root-key"
@@ -164,7 +157,14 @@ class Authority:
         if key.public_key() != self._root.public_key():
             raise KeysError(f"{path} is not the root key of {self.fleet}")
         with self._changing():
+            old = fingerprint(self._certificate)
             self._key, self._certificate = _certify(self.path, self.fleet, self._root, key)
+            if revoke_old:
+                self._roster.revoked_authorities.append(old)
+                self._roster.deny_serial += 1
+                self._roster.serial += 1
+                for name in list(self._roster.members):
+                    self._bundle(name, LEAF_HOURS)
             self._write_deny_list()
 
     def issue(self, request: bytes, *, hours: float = LEAF_HOURS) -> bytes:
@@ -185,6 +185,8 @@ class Authority:
             if name := self._roster.revoked_as(keys):
                 raise KeysError(f"these keys were revoked with {name}; make a new home on the node: tutelage keys init")
             self._roster.admit(keys)
+            if known is None and keys.common_name == self._policy().renewals:
+                self._roster.serial += 1  # all must learn where to renew
             if known is None:
                 self._write_for_routers()
             return self._bundle(keys.common_name, hours)
@@ -234,29 +236,38 @@ class Authority:
         """The signed deny list; b"" if nobody was ever revoked."""
         if not self._roster.deny_serial:
             return b""
-        content = {"serial": self._roster.deny_serial, "pseudonyms": sorted(self._roster.revoked)}
+        content = {
+            "serial": self._roster.deny_serial,
+            "pseudonyms": sorted(self._roster.revoked),
+            "authorities": self._roster.revoked_authorities,
+        }
         body = json.dumps(content, sort_keys=True).encode()
         return pack(certificates.der(self._certificate), sign(DENY_LIST, body, self._key))
 
     def access(self, name: str, role: Role) -> Access:
         """A node's part of the policy that was last published."""
-        policy = Policy.load(self.path / "published.toml")
+        policy = self._policy()
         control = derive(self._secret, b"", b"tutelage fleet 1")
         entries = {alias: Entry(rule, self._topic_secret(rule.topic.canonical())) for alias, rule in policy.topics.items()}
         pseudonyms = {name: record.pseudonym for name, record in self._roster.members.items()}
+        office = self._roster.members.get(policy.renewals)
         router = role == Role.ROUTER
         nodes = {name: one for name, one in pseudonyms.items() if self._roster.members[name].keys.role == Role.NODE}
         return Access(
             fleet=self.fleet,
             node=name,
-            serial=self._roster.serial,
+            serial=self._roster.serial_of(role),
             topics={} if router else {alias: entries[alias] for alias in policy.of_node(name)},
             control=Name.of_channel("notices", control),
             secret=b"" if router else control,
+            renewals=Renewals(office.pseudonym, raw(office.keys.sealing)) if office else None,
             routes=routes(entries.values(), nodes) if router else (),
             members=frozenset(nodes.values()) if router else frozenset(),
             routers=frozenset(pseudonyms.values()) - frozenset(nodes.values()) if router else frozenset(),
         )
+
+    def _policy(self) -> Policy:
+        return Policy.load(self.path / "published.toml")
 
     def _topic_secret(self, canonical: bytes) -> bytes:
         return hmac.digest(self._secret, pack(b"tutelage topic secret 1", canonical), hashlib.sha256)
@@ -289,7 +300,6 @@ class Authority:
 
     def _write_for_routers(self) -> None:
         """Routers must hear of every new or revoked member; nodes need not."""
-        self._roster.serial += 1
         for record in list(self._roster.members.values()):
             if record.keys.role == Role.ROUTER:
                 self._bundle(record.name, LEAF_HOURS)
@@ -297,7 +307,7 @@ class Authority:
     @contextmanager
     def _changing(self) -> Iterator[None]:
         """Another process may serve renewals meanwhile: read, change and write under a lock."""
-        with locked(self.path / ".lock"):
+        with self._lock:
             self._roster = Roster.load(self.path / "state.json")
             yield
             self._roster.save()
@@ -309,19 +319,6 @@ def _certify(
     key = Ed25519PrivateKey.generate()
     name = f"{fleet} authority"
     certificate = certificates.authority_certificate(name, key.public_key(), root, root_key, time.time(), AUTHORITY_DAYS)
-    _save(path / "ca.key", key, None)
+    save_key(path / "ca.key", key)
     write_atomic(path / "ca.pem", certificates.pem(certificate))
     return key, certificate
-
-
-def _load(path: Path, passphrase: bytes | None) -> Ed25519PrivateKey:
-    key = serialization.load_pem_private_key(path.read_bytes(), passphrase)
-    if not isinstance(key, Ed25519PrivateKey):
-        raise ValueError(f"{path.name} holds a key of another kind")
-    return key
-
-
-def _save(path: Path, key: Ed25519PrivateKey, passphrase: bytes | None) -> None:
-    encryption = serialization.BestAvailableEncryption(passphrase) if passphrase else serialization.NoEncryption()
-    content = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
-    write_atomic(path, content, private=True)

@@ -22,15 +22,15 @@ from pathlib import Path
 from typing import Literal
 
 from cryptography import x509
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
-from tutelage.files import locked, write_atomic
+from tutelage.files import Lock, write_atomic
 from tutelage.sgc import certificates
 from tutelage.sgc.access import Access
 from tutelage.sgc.bundle import Bundle, is_bundle
 from tutelage.sgc.errors import KeysError, NotIssued
+from tutelage.sgc.privatekeys import load_sealing_key, load_signing_key, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import NODE_NAME, Role
 from tutelage.sgc.trust import Member, Trust
@@ -57,10 +57,7 @@ class Home:
                 raise KeysError(f"{path} has format {content['format']}, this version of Tutelage reads {_FORMAT}")
             self.name, self.role = str(content["name"]), Role(content["role"])
             self.addresses = tuple(str(address) for address in content["addresses"])
-            signing, sealing = _load(self.key_file), _load(path / "sealing.key")
-            if not isinstance(signing, Ed25519PrivateKey) or not isinstance(sealing, X25519PrivateKey):
-                raise ValueError("a key of another kind")
-            self.signing_key, self.sealing_key = signing, sealing
+            self.signing_key, self.sealing_key = load_signing_key(self.key_file), load_sealing_key(path / "sealing.key")
         except FileNotFoundError as error:
             raise KeysError(
                 f"{path} is no node's home (no {Path(error.filename).name}); make one: tutelage keys init {path} --node NAME"
@@ -69,10 +66,12 @@ class Home:
             raise KeysError(f"{path} is damaged: {error}; restore it, or revoke the node and make a new home") from None
         self.version = 0
         self._lock = threading.RLock()
+        self._files = Lock(path / ".lock")
         self._seen: tuple[object, ...] = ()
         self._trust: Trust | None = None
         self._bundle: Bundle | None = None
         self._member: Member | None = None
+        self._order: tuple[float, int, float] = (0.0, 0, 0.0)
         self._deny: bytes | None = None
         self.refresh()
 
@@ -97,12 +96,13 @@ class Home:
             certificates.check_addresses(addresses)
         elif addresses:
             raise KeysError(f"{name} is a node, and nodes only dial out: addresses are for routers")
+        believed = None if root is None else _read_root(root)
         path.mkdir(parents=True, exist_ok=True)
         os.chmod(path, 0o700)
-        if root is not None:
-            write_atomic(path / "root.pem", _read_root(root).public_bytes(serialization.Encoding.PEM))
-        _save(path / "signing.key", Ed25519PrivateKey.generate())
-        _save(path / "sealing.key", X25519PrivateKey.generate())
+        if believed is not None:
+            write_atomic(path / "root.pem", certificates.pem(believed))
+        save_key(path / "signing.key", Ed25519PrivateKey.generate())
+        save_key(path / "sealing.key", X25519PrivateKey.generate())
         content = {"format": _FORMAT, "name": name, "role": str(role), "addresses": list(addresses)}
         write_atomic(path / "node.json", (json.dumps(content, indent=1) + "\n").encode())
         home = cls(path)
@@ -211,6 +211,8 @@ class Home:
             raise NotIssued(
                 f"{self.name} is revoked; make a new home and have it issued by the authority of {self.access.fleet}"
             )
+        if member.authority in self.trust.deny_list.authorities:
+            raise NotIssued(f"the certificate of {self.name} is by an authority that was revoked; {renew}")
         if now > member.not_after:
             raise NotIssued(f"the certificate of {self.name} expired {_span(now - member.not_after)} ago; {renew}")
         if now < member.not_before:
@@ -233,7 +235,7 @@ class Home:
         Raises:
             Refused: WRONG_AUTHORITY, ROLLBACK, NOT_FOR_US, MALFORMED, EXPIRED, REVOKED; nothing is changed.
         """
-        with self._lock, locked(self.path / ".lock"):
+        with self._lock, self._files:
             self.refresh()
             if not is_bundle(notice):
                 self._accept_deny_list(notice)
@@ -242,17 +244,15 @@ class Home:
             bundle, trust, member = Bundle.open(notice, self.sealing_key, self._trust)
             if member.node != self.name or member.role != self.role:
                 raise Refused(Reason.NOT_FOR_US, f"a bundle of the {member.role} {member.node}, and this is {self.name}")
-            if self._bundle is not None and (bundle.access.serial, member.not_before) < (
-                self._bundle.access.serial,
-                self.member.not_before,
-            ):
+            order = trust.since(bundle.authority), bundle.access.serial, member.not_before
+            if self._bundle is not None and order < self._order:
                 held = self._bundle.access.serial
                 raise Refused(
                     Reason.ROLLBACK,
                     f"a bundle with policy {bundle.access.serial}, and {self.name} has {held} or a newer leaf",
                 )
             self._trust = trust
-            if bundle.deny and trust.read_deny_list(bundle.deny).serial > trust.deny_list.serial:
+            if bundle.deny and trust.read_deny_list(bundle.deny).order > trust.deny_list.order:
                 self._accept_deny_list(bundle.deny)
             write_atomic(self.path / "bundle", notice, private=True)
             self.refresh()
@@ -285,30 +285,27 @@ class Home:
             # Not dated: a certificate that expired while the node was off must still be read, to be renewed.
             opened, trust, member = Bundle.open(bundle.read_bytes(), self.sealing_key, trust, dated=False)
             self._bundle, self._member = opened, member
+            self._order = trust.since(opened.authority), opened.access.serial, member.not_before
             leaf = certificates.pem(certificates.load(opened.leaf), certificates.load(opened.authority))
-            _write_if_other(self.leaf_file, leaf)
-            _write_if_other(self.root_file, certificates.pem(trust.root))
+            self._write_if_other(self.leaf_file, leaf)
+            self._write_if_other(self.root_file, certificates.pem(trust.root))
         deny = self.path / "deny"
         if trust is not None and deny.exists():
             notice = deny.read_bytes()
             trust.deny_list, self._deny = trust.read_deny_list(notice, dated=False), notice
         self._trust = trust
 
+    def _write_if_other(self, path: Path, content: bytes) -> None:
+        with self._files:
+            if not path.exists() or path.read_bytes() != content:
+                write_atomic(path, content)
+
     def _accept_deny_list(self, notice: bytes) -> None:
         new, old = self.trust.read_deny_list(notice), self.trust.deny_list
-        if new.serial < old.serial:
+        if new.order < old.order:
             raise Refused(Reason.ROLLBACK, f"deny list {new.serial}, older than the {old.serial} of {self.name}")
-        if new.serial > old.serial:
+        if new.order > old.order:
             write_atomic(self.path / "deny", notice)
-
-
-def _load(path: Path) -> object:
-    return serialization.load_pem_private_key(path.read_bytes(), None)
-
-
-def _save(path: Path, key: Ed25519PrivateKey | X25519PrivateKey) -> None:
-    content = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    write_atomic(path, content, private=True)
 
 
 def _read_root(path: Path) -> x509.Certificate:
@@ -318,12 +315,6 @@ def _read_root(path: Path) -> x509.Certificate:
         raise KeysError(f"no root certificate {path}") from None
     except (OSError, ValueError) as error:
         raise KeysError(f"{path} is not a certificate: {error}") from None
-
-
-def _write_if_other(path: Path, content: bytes) -> None:
-    if not path.exists() or path.read_bytes() != content:
-        with locked(path.with_name(".files.lock")):  # a running node and `tutelage keys` see a new bundle at the same time
-            write_atomic(path, content)
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:

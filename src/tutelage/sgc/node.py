@@ -29,6 +29,7 @@ from tutelage.sgc.messages import Message
 from tutelage.sgc.presence import Peer, Presence
 from tutelage.sgc.publisher import Publisher
 from tutelage.sgc.reasons import Reason, Refusals, Refused
+from tutelage.sgc.renewal import Renewer
 from tutelage.sgc.sealing import Opener, Sealer
 from tutelage.sgc.service import Requester, Server
 from tutelage.sgc.subscription import Subscription
@@ -85,6 +86,8 @@ class Node:
                 self._presence.directory.subscribe(entry.name, partial(self._somebody_came, alias))
         self._thread = threading.Thread(target=self._tend, name="sgc-tend", daemon=True)
         self._thread.start()
+        self._renewer = Renewer(home, transport.request)
+        self._renewer.start()
 
     @classmethod
     def open(cls, home: Path | Home, transport: Transport | None = None) -> Node:
@@ -221,6 +224,7 @@ class Node:
             return
         self._closed.set()
         self._wake.set()
+        self._renewer.close()
         for publisher in self._publishers.values():
             publisher.close()
         for subscription in self._subscriptions:

@@ -21,9 +21,12 @@ from tutelage.sgc.packet import (
     BATCH,
     BODY,
     HEADER,
+    IDENT,
     INTRODUCTION,
     MODES,
     PROOF,
+    SENDER,
+    STREAM,
     Buffer,
     Header,
     Opened,
@@ -40,7 +43,7 @@ from tutelage.sgc.session import Handshake, Session, slots
 from tutelage.sgc.trust import Member
 
 _LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys and policy
-_MAX_CIPHERS = 1024
+_MAX_STREAMS = 1024
 _MAX_SESSIONS = 1024
 
 
@@ -80,8 +83,8 @@ class Opener:
         self._lock = threading.RLock()
         self._looked = 0
         self._versions = (-1, -1)
-        self._epochs: dict[int, bytes] = {}
-        self._ciphers: OrderedDict[tuple[int, bytes, bytes], AESGCM] = OrderedDict()
+        self._look_count = 0
+        self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
         self._members: OrderedDict[bytes, Member] = OrderedDict()
         self._sessions: OrderedDict[tuple[bytes, bytes, bytes], Session] = OrderedDict()
 
@@ -128,11 +131,8 @@ class Opener:
             Refused: no answer to an offer of ours, or not from a node that may send. Counted.
         """
         with self._lock:
-            try:
+            with self.refusals.counting():
                 sender, salt, session = self._handshake.complete(answer)
-            except Refused as refused:
-                self.refusals.add(refused.reason)
-                raise
             self._sessions[sender, salt, session.ident] = session
             while len(self._sessions) > _MAX_SESSIONS:
                 self._sessions.popitem(last=False)
@@ -140,38 +140,38 @@ class Opener:
 
     def _open(self, packet: memoryview, bind: bytes, now: int) -> list[Opened]:
         header = read_header(packet, self._mode)
-        bare = bool(header.flags & BARE)
-        if not bare:
-            self._replay.check(header.sender, header.salt, header.first, 1, header.sent, now)  # cheap, so first
-        cipher = self._cipher(header, now)
         raw = bytes(packet[:HEADER])
+        bare = header.flags & BARE
+        if not bare:
+            self._replay.check(header.sender, header.salt, header.first, header.sent, now)  # cheap, so first
+        stream = self._stream(header, raw, now)
         start, end = HEADER + header.introduction, len(packet) - header.proof
         if bare:
-            _decrypt(cipher, BARE_BODY, header, packet[start:end], raw)
-            member = self._member(cipher, header, raw, packet[HEADER:start], now)
-            return self._anchor(cipher, BARE_PROOF, header, raw, packet[end:], member, now)
-        body = _decrypt(cipher, BODY, header, packet[start:end], raw + bind)
+            _decrypt(stream.cipher, BARE_BODY, packet[start:end], raw)
+            member = self._member(stream, header, raw, packet[HEADER:start], now)
+            return self._anchor(stream, BARE_PROOF, header, raw, packet[end:], member, now)
+        body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
         if self._authenticity == Authenticity.SESSION:
-            member = self._session_member(header, packet, end, now)
+            member = self._session_member(header, raw, packet, end, now)
         else:
-            member = self._member(cipher, header, raw, packet[HEADER:start], now)
-        payloads = [bytes(part) for part in split_batch(body)] if header.flags & BATCH else [body]
-        messages = self._messages(header, raw, member, payloads)
+            member = self._member(stream, header, raw, packet[HEADER:start], now)
+        messages = self._messages(header, raw, member, body)
         if self._authenticity == Authenticity.CHAIN:
-            return self._chained(cipher, header, raw, bind, body, packet[end:], member, messages, now)
+            return self._chained(stream, header, raw, bind, body, packet[end:], member, messages, now)
         if self._authenticity == Authenticity.SIGNATURE:
-            signature = _decrypt(cipher, PROOF, header, packet[end:], raw)
+            signature = _decrypt(stream.cipher, PROOF, packet[end:], raw)
             try:
                 member.signing.verify(signature, self._statements.message(raw, bind, body))
             except InvalidSignature:
                 raise Refused(Reason.FORGED, f"a message of {self.alias} that {member.node} did not sign") from None
-        self._replay.admit(header.sender, header.salt, header.first, len(messages), header.sent, now)
-        self._remember(header, cipher, member)
+        self._replay.admit(header.sender, header.salt, header.first, len(messages), header.sent)
+        if stream.member is not member:
+            self._remember(stream, raw, member)
         return messages
 
     def _chained(
         self,
-        cipher: AESGCM,
+        stream: _Stream,
         header: Header,
         raw: bytes,
         bind: bytes,
@@ -181,67 +181,85 @@ class Opener:
         messages: list[Opened],
         now: int,
     ) -> list[Opened]:
-        stream, statement = (header.sender, header.salt), self._statements.message(raw, bind, body)
+        statement = self._statements.message(raw, bind, body)
         with self._lock:
-            ready = self._confirmation.message(stream, header.first, statement, messages, len(body), now)
+            ready = self._confirmation.message(
+                (header.sender, header.salt), header.first, statement, messages, len(body), now
+            )
         if ready is not None:
-            self._replay.admit(header.sender, header.salt, header.first, len(ready), header.sent, now)
-        self._remember(header, cipher, member)
+            self._replay.admit(header.sender, header.salt, header.first, len(ready), header.sent)
+        if stream.member is not member:
+            self._remember(stream, raw, member)
         if header.flags & ANCHOR:
-            return (ready or []) + self._anchor(cipher, PROOF, header, raw, proof, member, now)
+            return (ready or []) + self._anchor(stream, PROOF, header, raw, proof, member, now)
         return ready or []
 
     def _anchor(
-        self, cipher: AESGCM, purpose: int, header: Header, raw: bytes, proof: memoryview, member: Member, now: int
+        self, stream: _Stream, purpose: int, header: Header, raw: bytes, proof: memoryview, member: Member, now: int
     ) -> list[Opened]:
-        anchor = _decrypt(cipher, purpose, header, proof, raw)
+        anchor = _decrypt(stream.cipher, purpose, proof, raw)
 
         def admit(first: int, messages: list[Opened]) -> None:
-            self._replay.admit(header.sender, header.salt, first, len(messages), messages[0].sent, now)
+            self._replay.check_time(messages[0].sent, now)
+            self._replay.admit(header.sender, header.salt, first, len(messages), messages[0].sent)
 
         with self._lock:
             return self._confirmation.anchor((header.sender, header.salt), anchor, member.signing, admit)
 
-    def _messages(self, header: Header, raw: bytes, member: Member, payloads: list[bytes]) -> list[Opened]:
-        authentic = not (self._authenticity == Authenticity.CHAIN and self._provisional)
-        found = []
-        for sequence, payload in enumerate(payloads, header.first):
-            ident = raw[12:44] + sequence.to_bytes(8, "big")
-            found.append(Opened(payload, member.node, sequence, header.salt, header.sent, header.epoch, authentic, ident))
-        return found
+    def _messages(self, header: Header, raw: bytes, member: Member, body: bytes) -> list[Opened]:
+        authentic = self._authenticity != Authenticity.CHAIN or not self._provisional
+        node, first, salt, sent, epoch = member.node, header.first, header.salt, header.sent, header.epoch
+        if not header.flags & BATCH:
+            return [Opened(body, node, first, salt, sent, epoch, authentic, raw[IDENT])]
+        who = raw[12:44]
+        return [
+            Opened(bytes(part), node, sequence, salt, sent, epoch, authentic, who + sequence.to_bytes(8, "big"))
+            for sequence, part in enumerate(split_batch(body), first)
+        ]
 
-    def _cipher(self, header: Header, now: int) -> AESGCM:
-        """The key of the packet's stream. Not remembered yet: anybody can make up a salt."""
-        with self._lock:
+    def _stream(self, header: Header, raw: bytes, now: int) -> _Stream:
+        """What is known of the packet's stream; of a new one nothing is kept yet, as anybody can make up a salt.
+
+        Looks from time to time, and at every change: is the epoch accepted, may the sender still send, may we receive?
+        """
+        if (
+            now - self._looked > _LOOK_EVERY
+            or now < self._looked
+            or self._versions != (self._keyring.version, self._home.version)
+        ):
             self._look(now)
-            key = self._epochs.get(header.epoch)
-            if key is None:
-                key = self._epochs[header.epoch] = self._keyring.opening(self.alias, header.epoch, now / 1e9).key
-            found = self._ciphers.get((header.epoch, header.sender, header.salt))
-        if found is None:
-            found = AESGCM(message_key(key, self._name, self.lane, header.epoch, header.sender, header.salt))
-        return found
+        stream = self._streams.get(raw[STREAM])
+        if stream is not None and stream.look == self._look_count:
+            return stream
+        key = self._keyring.opening(self.alias, header.epoch, now / 1e9).key
+        if stream is None:
+            cipher = message_key(key, self._name, self.lane, header.epoch, header.sender, header.salt)
+            return _Stream(AESGCM(cipher), self._look_count)
+        if stream.member is not None and not header.introduction:
+            self._check(stream.member, now)
+        stream.look = self._look_count
+        return stream
 
-    def _remember(self, header: Header, cipher: AESGCM, member: Member) -> None:
+    def _remember(self, stream: _Stream, raw: bytes, member: Member) -> None:
         """Keep what an authentic packet taught."""
-        key = header.epoch, header.sender, header.salt
         with self._lock:
-            if self._ciphers.get(key) is not cipher:
-                self._ciphers[key] = cipher
-                while len(self._ciphers) > _MAX_CIPHERS:
-                    self._ciphers.popitem(last=False)
-            if self._authenticity != Authenticity.SESSION and self._members.get(header.sender) is not member:
-                self._members[header.sender] = member
+            stream.member = member
+            self._streams[raw[STREAM]] = stream
+            while len(self._streams) > _MAX_STREAMS:
+                self._streams.popitem(last=False)
+            if self._authenticity != Authenticity.SESSION:
+                self._members[raw[SENDER]] = member
                 while len(self._members) > MAX_SENDERS:
                     self._members.popitem(last=False)
 
-    def _member(self, cipher: AESGCM, header: Header, raw: bytes, introduction: memoryview, now: int) -> Member:
+    def _member(self, stream: _Stream, header: Header, raw: bytes, introduction: memoryview, now: int) -> Member:
         """Who the sender is, from its introduction or an earlier one; it may send, now."""
         if header.introduction:
-            credential = _decrypt(cipher, INTRODUCTION, header, introduction, raw)
-            member = self._home.trust.read(credential)
+            member = self._home.trust.read(_decrypt(stream.cipher, INTRODUCTION, introduction, raw))
             if self._id_of(member) != header.sender:
                 raise Refused(Reason.FORGED, f"a packet of {self.alias} with the credential of another, {member.node}")
+        elif stream.member is not None:
+            return stream.member  # `_stream` has checked it
         else:
             found = self._members.get(header.sender) or self._from_keyring(header.sender)
             if found is None:
@@ -250,11 +268,11 @@ class Opener:
         self._check(member, now)
         return member
 
-    def _session_member(self, header: Header, packet: memoryview, end: int, now: int) -> Member:
-        for ident, tag in slots(packet[end:]).items():
+    def _session_member(self, header: Header, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
+        for ident, tag in slots(packet[end:]):
             session = self._sessions.get((header.sender, header.salt, ident))
             if session is not None and now / 1e9 < session.until:
-                session.check(header.first, packet[:end], tag)
+                session.check(raw, packet[:end], tag)
                 self._check(session.member, now)
                 return session.member
         raise Refused(Reason.NO_SESSION, f"a packet of {self.alias} by a sender with whom no session is open")
@@ -271,20 +289,34 @@ class Opener:
         return key_id(self._entry.secret, b"sender", member.signing)
 
     def _look(self, now: int) -> None:
-        """From time to time, and at every change: which epochs are accepted, and may this node still receive?"""
-        versions = (self._keyring.version, self._home.version)
-        if versions == self._versions and 0 <= now - self._looked < _LOOK_EVERY:
-            return
-        self._epochs.clear()
-        if versions[1] != self._versions[1]:
-            self._entry = self._home.access.check(self.alias, self.lane, sends=False)
-            if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
-                raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
-        self._versions, self._looked = versions, now
+        with self._lock:
+            versions = (self._keyring.version, self._home.version)
+            if versions[1] != self._versions[1]:
+                self._entry = self._home.access.check(self.alias, self.lane, sends=False)
+                if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
+                    raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
+            self._versions, self._looked = versions, now
+            self._look_count += 1
 
 
-def _decrypt(cipher: AESGCM, purpose: int, header: Header, sealed: memoryview, associated: bytes) -> bytes:
+class _Stream:
+    """One start of one sender under one epoch.
+
+    Attributes:
+        cipher: of its packets.
+        look: when it was last checked, in looks.
+        member: who it is; None before the first authentic packet.
+    """
+
+    __slots__ = ("cipher", "look", "member")
+
+    def __init__(self, cipher: AESGCM, look: int) -> None:
+        self.cipher, self.look = cipher, look
+        self.member: Member | None = None
+
+
+def _decrypt(cipher: AESGCM, purpose: int, sealed: memoryview, associated: bytes) -> bytes:
     try:
-        return cipher.decrypt(nonce(purpose, header.first), sealed, associated)
+        return cipher.decrypt(nonce(purpose, associated), sealed, associated)
     except InvalidTag:
         raise Refused(Reason.TAMPERED, "a packet that was changed on its way, or not made with the topic's key") from None

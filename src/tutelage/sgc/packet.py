@@ -2,7 +2,7 @@
 
     header (60 bytes) | introduction, sometimes | ciphertext | tag (16) | proof of the sender
 
-    header: version 1 | mode 1 | flags 2 | epoch 4 | length of introduction 2 | of proof 2 | sender 16 | salt 16 |
+    header: version 1 | mode 1 | flags 2 | length of introduction 2 | of proof 2 | epoch 4 | sender 16 | salt 16 |
             sequence 8 | sent 8
 
 All integers are big endian; `sent` is in nanoseconds since 1970. The header is in clear and authenticated. The sender is a
@@ -16,7 +16,6 @@ import os
 import struct
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from tutelage.errors import ConfigError
@@ -36,8 +35,10 @@ TAG = 16
 SALT_BYTES = 16
 VERSION = 1
 MODES = {Authenticity.SIGNATURE: 1, Authenticity.SESSION: 2, Authenticity.CHAIN: 3}
-_HEADER = struct.Struct(">BBHIHH16s16sQQ")
+_HEADER = struct.Struct(">BBHHHI16s16sQQ")
 HEADER = _HEADER.size
+STREAM, SENDER, IDENT = slice(8, 44), slice(12, 28), slice(12, 52)
+"""Parts of a header: epoch, sender and salt; sender; sender, salt and sequence."""
 MAX_PACKET = HEADER + MAX_PAYLOAD + 4 * (MAX_BATCH + 1) + TAG + 2 * MAX_PART
 _CONTEXT = b"tutelage message 1"
 _CHUNK = 1 << 20
@@ -48,6 +49,7 @@ BATCH, ANCHOR, BARE = 1, 2, 4
 
 BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG = range(6)
 """What a nonce is for: the first 4 of its 12 bytes, so that one sequence number serves several without repetition."""
+_PURPOSES = [purpose.to_bytes(4, "big") for purpose in range(6)]
 
 
 class Header(NamedTuple):
@@ -56,9 +58,9 @@ class Header(NamedTuple):
     version: int
     mode: int
     flags: int
-    epoch: int
     introduction: int
     proof: int
+    epoch: int
     sender: bytes
     salt: bytes
     first: int
@@ -93,12 +95,13 @@ def read_header(packet: memoryview, mode: int) -> Header:
 
 def ident(packet: Buffer) -> bytes:
     """40 bytes that identify a packet: sender, salt and sequence. A reply binds to that of its request."""
-    return bytes(memoryview(packet)[12:52])
+    return bytes(memoryview(packet)[IDENT])
 
 
-def nonce(purpose: int, sequence: int) -> bytes:
-    """12 bytes that never repeat under one key: keys differ by salt, and a salt is never used twice."""
-    return (purpose << 64 | sequence).to_bytes(12, "big")
+def nonce(purpose: int, header: bytes) -> bytes:
+    """12 bytes that never repeat under one key: what for, and the sequence number in a header. Keys differ by salt, and a
+    salt is never used twice."""
+    return _PURPOSES[purpose] + header[44:52]
 
 
 def message_key(epoch_key: bytes, name: bytes, lane: Lane, epoch: int, sender: bytes, salt: bytes) -> bytes:
@@ -167,29 +170,28 @@ def split_batch(body: Buffer) -> list[memoryview]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Opened:
+class Opened(NamedTuple):
     """A message that was opened.
 
     Attributes:
-        payload: the message; a view may share memory with other messages of its batch.
+        payload: the message.
         sender: name of the node.
         sequence: 1, 2, ... within (sender, salt), without gaps where nothing was lost. Batches count every message.
         salt: 16 bytes, new each time that the sender starts.
         sent: nanoseconds since 1970 on the sender's clock.
         epoch: of the key.
         authentic: False only for provisional messages of chain mode that are not confirmed yet.
-        ident: 40 bytes that identify the packet: sender, salt and sequence; a reply binds to its request's.
+        ident: 40 bytes that identify the message: sender, salt and sequence; a reply binds to its request's.
     """
 
-    payload: bytes | memoryview = field(repr=False)
+    payload: bytes
     sender: str
     sequence: int
     salt: bytes
     sent: int
     epoch: int
     authentic: bool
-    ident: bytes = field(repr=False)
+    ident: bytes
 
 
 _threads: ThreadPoolExecutor | None = None

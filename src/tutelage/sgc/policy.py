@@ -13,6 +13,9 @@
     delivery = "lossy"                  # or "reliable"
     max_age = 0.5                       # seconds
 
+Beside `topics` there may be `renewals = "office"`: the node that renews certificates over the network
+(`tutelage keys serve`).
+
 The fleet's authority signs each node's part of it (`Access`); no node is told more than its own part.
 """
 
@@ -25,16 +28,40 @@ from pathlib import Path
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.access import Entry, Route
-from tutelage.sgc.rules import Kind, Lane, TopicRule
+from tutelage.sgc.rules import NODE_NAME, Kind, Lane, TopicRule
 
 VERSION = 1
+TEMPLATE = """version = 1
+
+# Who may say and hear what. Without a table here nobody may do anything. After a change: tutelage keys issue FOLDER --policy
+#
+# renewals = "office"               # the node that renews certificates over the network: tutelage keys serve
+#
+# [topics.camera]
+# node = "drone-1"                  # metadata: its 256-bit name is made from it
+# interface = "/camera"
+# type = "sensor_msgs/msg/Image"
+# owner = "drone-1"                 # the node that hands out the topic's keys
+# publish = ["drone-1"]
+# subscribe = ["server", "operator-*"]
+# authenticity = "signature"        # or "session", "chain"
+# delivery = "lossy"                # or "reliable"
+# max_age = 0.5                     # seconds; commands should have one
+"""
+"""The file of a new fleet."""
 
 
 @dataclass(frozen=True)
 class Policy:
-    """All topics of a fleet, by alias."""
+    """What the file says.
+
+    Attributes:
+        topics: all of the fleet, by alias.
+        renewals: the node that renews certificates and hands out changes of the policy over the network; "" for none.
+    """
 
     topics: Mapping[str, TopicRule]
+    renewals: str = ""
 
     @classmethod
     def parse(cls, text: str) -> Policy:
@@ -47,7 +74,7 @@ class Policy:
             content = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"the policy is not TOML: {error}") from None
-        if unknown := sorted(content.keys() - {"version", "topics"}):
+        if unknown := sorted(content.keys() - {"version", "topics", "renewals"}):
             raise ConfigError(f"the policy has an unknown field {unknown[0]!r}; topics are tables, [topics.camera]")
         if content.get("version") != VERSION:
             raise ConfigError(f"the policy needs version = {VERSION}, not {content.get('version')!r}")
@@ -63,7 +90,10 @@ class Policy:
                     f"topics {other!r} and {alias!r} of the policy have the same metadata, so the same name; "
                     f'give one of them unique = "..."'
                 )
-        return cls(topics)
+        renewals = content.get("renewals", "")
+        if renewals != "" and not (isinstance(renewals, str) and NODE_NAME.fullmatch(renewals)):
+            raise ConfigError(f"renewals of the policy must be the name of one node, not {renewals!r}")
+        return cls(topics, renewals)
 
     @classmethod
     def load(cls, path: Path) -> Policy:

@@ -47,15 +47,20 @@ class Window:
 
     def add(self, first: int, count: int, sent: int) -> None:
         """Mark them as seen."""
-        for block, bits in _spans(first, count):
-            self._blocks[block] = self._blocks.get(block, 0) | bits
         last = first + count - 1
+        if count == 1:
+            self._blocks[first // _BLOCK] = self._blocks.get(first // _BLOCK, 0) | 1 << first % _BLOCK
+        else:
+            for block, bits in _spans(first, count):
+                self._blocks[block] = self._blocks.get(block, 0) | bits
         if last // _BLOCK > self.highest // _BLOCK:
             oldest = (last - WINDOW) // _BLOCK
             for block in [block for block in self._blocks if block < oldest]:
                 del self._blocks[block]
-        self.highest = max(self.highest, last)
-        self.sent = max(self.sent, sent)
+        if last > self.highest:
+            self.highest = last
+        if sent > self.sent:
+            self.sent = sent
 
 
 def _spans(first: int, count: int) -> Iterator[tuple[int, int]]:
@@ -81,33 +86,38 @@ class Replay:
         self._senders: OrderedDict[bytes, _Sender] = OrderedDict()
         self._lock = threading.Lock()
 
-    def check(self, sender: bytes, salt: bytes, first: int, count: int, sent: int, now: int) -> None:
-        """Would `admit` take it? Remembers nothing, so it may be asked before a message is authenticated.
+    def check(self, sender: bytes, salt: bytes, first: int, sent: int, now: int) -> None:
+        """Could a message be taken, as far as its header says? Remembers nothing, so it may be asked before the message is
+        authenticated.
 
         Raises:
             Refused: TOO_OLD, FUTURE, REPLAYED or STALE.
         """
         self.check_time(sent, now)
-        with self._lock:
-            self._check(sender, salt, first, count, sent)
+        known = self._senders.get(sender)
+        self._check(known, known.windows.get(salt) if known is not None else None, first, 1, sent)
 
-    def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int, now: int) -> None:
-        """Take a message (a batch of `count`) that is authentic, once.
+    def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int) -> None:
+        """Take a message (a batch of `count`) that is authentic, once. Its time is for `check_time` to check.
 
         Raises:
-            Refused: TOO_OLD, FUTURE, REPLAYED or STALE.
+            Refused: REPLAYED or STALE.
         """
-        self.check_time(sent, now)
         with self._lock:
-            self._check(sender, salt, first, count, sent)
             known = self._senders.get(sender)
+            window = known.windows.get(salt) if known is not None else None
+            self._check(known, window, first, count, sent)
             if known is None:
                 known = self._senders[sender] = _Sender(self._floor)
                 if len(self._senders) > MAX_SENDERS:
                     _, forgotten = self._senders.popitem(last=False)
                     self._floor = max(self._floor, forgotten.newest())
-            self._senders.move_to_end(sender)
-            known.window(salt).add(first, count, sent)
+            if window is None:
+                window = known.add(salt)
+            elif len(self._senders) > 1 or len(known.windows) > 1:
+                self._senders.move_to_end(sender)
+                known.windows.move_to_end(salt)
+            window.add(first, count, sent)
 
     def check_time(self, sent: int, now: int) -> None:
         """Is a time of sending neither too long ago nor in the future?
@@ -122,13 +132,11 @@ class Replay:
             age, limit = (now - sent) / 1e9, self._max_age / 1e9
             raise Refused(Reason.TOO_OLD, f"sent {age:.2f} s ago, and the topic's maximum age is {limit:g} s")
 
-    def _check(self, sender: bytes, salt: bytes, first: int, count: int, sent: int) -> None:
-        known = self._senders.get(sender)
-        window = known.windows.get(salt) if known else None
+    def _check(self, known: _Sender | None, window: Window | None, first: int, count: int, sent: int) -> None:
         if window is not None:
             if not window.fresh(first, count):
                 raise Refused(Reason.REPLAYED, f"message {first} was seen before, or is behind the window")
-        elif sent <= (known.floor if known else self._floor):
+        elif sent <= (known.floor if known is not None else self._floor):
             raise Refused(Reason.STALE, "a stream that is older than what was dealt with before")
 
 
@@ -139,15 +147,12 @@ class _Sender:
         self.floor = floor
         self.windows: OrderedDict[bytes, Window] = OrderedDict()
 
-    def window(self, salt: bytes) -> Window:
-        found = self.windows.get(salt)
-        if found is None:
-            found = self.windows[salt] = Window()
-            if len(self.windows) > MAX_SALTS:
-                _, forgotten = self.windows.popitem(last=False)
-                self.floor = max(self.floor, forgotten.sent)
-        self.windows.move_to_end(salt)
-        return found
+    def add(self, salt: bytes) -> Window:
+        window = self.windows[salt] = Window()
+        if len(self.windows) > MAX_SALTS:
+            _, forgotten = self.windows.popitem(last=False)
+            self.floor = max(self.floor, forgotten.sent)
+        return window
 
     def newest(self) -> int:
         return max([self.floor, *(window.sent for window in self.windows.values())])

@@ -47,16 +47,20 @@ class Roster:
         self.path = path
         self.fleet = fleet
         self.serial = 1
+        self.members_serial = 0
         self.deny_serial = 0
         self.members: dict[str, Record] = {}
         self.revoked: dict[str, tuple[str, str]] = {}
         """By pseudonym: name and signing key (hexadecimal), so that these keys are not let in again."""
+        self.revoked_authorities: list[str] = []
+        """Fingerprints of the authority's own certificates whose keys were stolen."""
 
     def admit(self, keys: Keys) -> None:
         """The node `keys.common_name`: a new member gets a random pseudonym, a known one may get other addresses."""
         name = keys.common_name
         known = self.members.get(name)
         self.members[name] = replace(known, keys=keys) if known else Record(name, secrets.token_hex(16), keys)
+        self.members_serial += known is None
 
     def revoked_as(self, keys: Keys) -> str | None:
         """The name under which keys were revoked, if they were."""
@@ -71,6 +75,11 @@ class Roster:
         record = self.members.pop(name)
         self.revoked[record.pseudonym] = (name, raw(record.keys.signing).hex())
         self.deny_serial += 1
+        self.members_serial += 1
+
+    def serial_of(self, role: Role) -> int:
+        """Serial of the part of the policy of nodes, or of routers, which must also know who is a member."""
+        return self.serial + (self.members_serial if role == Role.ROUTER else 0)
 
     def save(self) -> None:
         """Write the file, for the owner's eyes only."""
@@ -79,8 +88,10 @@ class Roster:
             "fleet": self.fleet,
             "serial": self.serial,
             "deny_serial": self.deny_serial,
+            "members_serial": self.members_serial,
             "members": {name: _to_json(record) for name, record in self.members.items()},
             "revoked": self.revoked,
+            "revoked_authorities": self.revoked_authorities,
         }
         write_atomic(self.path, (json.dumps(content, indent=1) + "\n").encode(), private=True)
 
@@ -97,8 +108,10 @@ class Roster:
                 raise ValueError(f"format {content['format']}, and this version reads {_FORMAT}")
             roster = cls(path, str(content["fleet"]))
             roster.serial, roster.deny_serial = int(content["serial"]), int(content["deny_serial"])
+            roster.members_serial = int(content["members_serial"])
             roster.members = {name: _from_json(name, one) for name, one in content["members"].items()}
             roster.revoked = {str(pseudonym): (str(name), str(key)) for pseudonym, (name, key) in content["revoked"].items()}
+            roster.revoked_authorities = [str(one) for one in content["revoked_authorities"]]
         except (KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{path.name}: {error!r}") from None
         return roster

@@ -23,6 +23,8 @@ from tutelage.sgc.access import Role
 from tutelage.sgc.acl import access_control
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Refusals, Refused
+from tutelage.sgc.renewal import Renewer
+from tutelage.sgc.transport.base import NoReply
 from tutelage.sgc.transport.config import Endpoint, Identity, Timers, import_zenoh, zenoh_config, zenoh_settings
 from tutelage.sgc.transport.tunnel import TunnelServer
 
@@ -85,6 +87,7 @@ class Router:
         self._tunnels: list[TunnelServer] = []
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="sgc-router", daemon=True)
+        self._renewer = Renewer(home, self._ask)
 
     def start(self) -> None:
         """Listen.
@@ -94,10 +97,12 @@ class Router:
         """
         self._begin()
         self._thread.start()
+        self._renewer.start()
 
     def close(self) -> None:
         """Stop."""
         self._closed.set()
+        self._renewer.close()
         if self._thread.is_alive():
             self._thread.join(5.0)
         self._end()
@@ -126,7 +131,8 @@ class Router:
     def rules(self) -> dict[str, Any]:
         """The access control that the home's policy and deny list call for now."""
         access, denied = self.home.access, self.home.trust.deny_list.pseudonyms
-        return access_control(access.routes, access.members, access.routers, access.control, denied)
+        office = access.renewals.pseudonym if access.renewals else ""
+        return access_control(access.routes, access.members, access.routers, access.control, denied, office)
 
     def _settings(self) -> dict[str, Any]:
         settings = zenoh_settings("router", self.config.timers, self._identity)
@@ -173,6 +179,13 @@ class Router:
             self.refusals.add(refused.reason)
         except TutelageError as error:
             log.warning("%s: %s", self.home.name, error)
+
+    def _ask(self, key: str, payload: bytes, timeout: float) -> bytes:
+        session = self._session
+        for reply in session.get(key, payload=payload, timeout=timeout) if session is not None else ():
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+        raise NoReply(f"nobody renews the certificate of {self.home.name} now")
 
     def _follow(self) -> None:
         """Start again when the folder calls for other rules, or holds a new certificate."""

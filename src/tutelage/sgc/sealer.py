@@ -137,8 +137,8 @@ class Sealer:
             length = self._link.proof_bytes(with_message=False) + TAG
             header = self._header(ANCHOR | BARE, self.sequence, 0, length, now)
             anchor = self._link.anchor(self._sender, self.salt, self._statements, self._home.signing_key)
-            body = cipher.encrypt(nonce(BARE_BODY, self.sequence), b"", header)
-            return header + body + cipher.encrypt(nonce(BARE_PROOF, self.sequence), anchor, header)
+            body = cipher.encrypt(nonce(BARE_BODY, header), b"", header)
+            return header + body + cipher.encrypt(nonce(BARE_PROOF, header), anchor, header)
 
     def accept_session(self, offer: bytes) -> bytes:
         """Session mode: answer a receiver's `Opener.offer_session`. From now on packets carry a tag for it.
@@ -152,11 +152,8 @@ class Sealer:
         if self._authenticity != Authenticity.SESSION:
             raise NotAllowed(f'{self.alias} has authenticity "{self._authenticity}" in the policy, so it has no sessions')
         with self._lock:
-            try:
+            with self.refusals.counting():
                 answer, session = self._handshake.answer(offer, self._sender, self.salt)
-            except Refused as refused:
-                self.refusals.add(refused.reason)
-                raise
             same = [one for one in self._sessions if one.member.pseudonym == session.member.pseudonym]
             kept = [one for one in self._sessions if one not in same[:-1]]
             self._sessions = [*kept, session][-MAX_SESSIONS:]
@@ -187,8 +184,8 @@ class Sealer:
             packet[:HEADER] = header
             with memoryview(packet) as view:
                 if introduction:
-                    cipher.encrypt_into(nonce(INTRODUCTION, first), introduction, header, view[HEADER:start])
-                cipher.encrypt_into(nonce(BODY, first), body, header + bind, view[start:])
+                    cipher.encrypt_into(nonce(INTRODUCTION, header), introduction, header, view[HEADER:start])
+                cipher.encrypt_into(nonce(BODY, header), body, header + bind, view[start:])
             packet += self._proof(cipher, header, bind, body, flags, first, packet, now)
             return packet
 
@@ -203,21 +200,21 @@ class Sealer:
         self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: bytearray, now: int
     ) -> bytes:
         if self._authenticity == Authenticity.SESSION:
-            return tags(self._sessions, first, sealed)
+            return tags(self._sessions, header, sealed)
         statement = self._statements.message(header, bind, body)
         key = self._home.signing_key
         # A signature is sealed too: in clear, anyone who knows a node's certificate could tell which packets are its own.
         if self._authenticity == Authenticity.SIGNATURE:
-            return cipher.encrypt(nonce(PROOF, first), key.sign(statement), header)
+            return cipher.encrypt(nonce(PROOF, header), key.sign(statement), header)
         self._link.add(first, statement, now)
         if not flags & ANCHOR:
             return b""
         anchor = self._link.anchor(self._sender, self.salt, self._statements, key)
-        return cipher.encrypt(nonce(PROOF, first), anchor, header)
+        return cipher.encrypt(nonce(PROOF, header), anchor, header)
 
     def _header(self, flags: int, first: int, introduction: int, proof: int, now: int) -> bytes:
         mode = MODES[self._authenticity]
-        return Header(VERSION, mode, flags, self._epoch, introduction, proof, self._sender, self.salt, first, now).pack()
+        return Header(VERSION, mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now).pack()
 
     def _look(self, now: int) -> AESGCM:
         """The cipher to use now. Looks from time to time, and at every change, whether this node may still send."""

@@ -52,18 +52,18 @@ class Session:
     until: float
     cipher: AESGCM
 
-    def tag(self, sequence: int, sealed: Buffer) -> bytes:
-        """16 bytes over header and ciphertext."""
-        return self.cipher.encrypt(nonce(SESSION_TAG, sequence), b"", sealed)
+    def tag(self, header: bytes, sealed: Buffer) -> bytes:
+        """16 bytes over header and ciphertext, which are both in `sealed`."""
+        return self.cipher.encrypt(nonce(SESSION_TAG, header), b"", sealed)
 
-    def check(self, sequence: int, sealed: Buffer, tag: Buffer) -> None:
+    def check(self, header: bytes, sealed: Buffer, tag: Buffer) -> None:
         """Was the tag made by the other end?
 
         Raises:
             Refused: FORGED.
         """
         try:
-            self.cipher.decrypt(nonce(SESSION_TAG, sequence), tag, sealed)
+            self.cipher.decrypt(nonce(SESSION_TAG, header), tag, sealed)
         except InvalidTag:
             raise Refused(Reason.FORGED, f"a tag that is not by {self.member.node}") from None
 
@@ -161,17 +161,17 @@ class Handshake:
         return Session(material[32:], member, until, AESGCM(material[:32]))
 
 
-def tags(sessions: list[Session], sequence: int, sealed: Buffer) -> bytes:
+def tags(sessions: list[Session], header: bytes, sealed: Buffer) -> bytes:
     """The proof of a packet: id and tag of every session."""
-    return b"".join(session.ident + session.tag(sequence, sealed) for session in sessions)
+    return b"".join(session.ident + session.tag(header, sealed) for session in sessions)
 
 
-def slots(proof: memoryview) -> dict[bytes, memoryview]:
-    """The tags of a proof, by session.
+def slots(proof: memoryview) -> list[tuple[bytes, memoryview]]:
+    """The sessions of a proof, with their tags.
 
     Raises:
         Refused: MALFORMED.
     """
     if len(proof) % SLOT or len(proof) > SLOT * MAX_SESSIONS:
         raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
-    return {bytes(proof[at : at + SESSION_ID]): proof[at + SESSION_ID : at + SLOT] for at in range(0, len(proof), SLOT)}
+    return [(bytes(proof[at : at + SESSION_ID]), proof[at + SESSION_ID : at + SLOT]) for at in range(0, len(proof), SLOT)]
