@@ -6,7 +6,8 @@ import re
 import time
 from dataclasses import dataclass, field
 
-from tutelage.sgc.proxies.dds_domain import MARK, Domain, parse_user_data
+from tutelage.sgc.proxies.dds_domain import Domain
+from tutelage.sgc.proxies.dds_qos import mark_of
 
 _TYPE = re.compile(r"(\w+)::(msg|srv|action)::dds_::(\w+)_")
 
@@ -45,9 +46,8 @@ def discover(domain: Domain, seconds: float) -> list[Found]:
         for endpoint in reader.take(N=10_000):
             if not endpoint.sample_info.valid_data:
                 continue
-            data = endpoint.qos[Policy.Userdata].data if Policy.Userdata in endpoint.qos else b""
             entry = _entry(endpoint.topic_name, endpoint.type_name)
-            if entry is None or MARK in parse_user_data(bytes(data)):
+            if entry is None or mark_of(endpoint.qos):
                 continue
             entry = found.setdefault((entry.name, entry.type), entry)
             if entry.service and endpoint.topic_name.startswith("rr/"):

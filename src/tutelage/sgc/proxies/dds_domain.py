@@ -12,27 +12,15 @@ import uuid
 from collections.abc import Callable
 from typing import Any
 
-from tutelage.errors import MissingExtraError
+from tutelage.errors import ConfigError, MissingExtraError
 from tutelage.sgc.proxies import dds_raw
+from tutelage.sgc.proxies.dds_qos import MARK, dds_qos, mark_of, policy_name
 from tutelage.sgc.proxies.ros_names import Channel
 from tutelage.sgc.proxies.ros_qos import QosProfile
 
 log = logging.getLogger(__name__)
-MARK = "tutelage"
-"""Key in the USER_DATA of what a proxy writes. No proxy takes what a proxy has written, so nothing goes round in circles."""
 _NO_TIME = 2**63 - 1  # DDS's infinity, nanoseconds
-_WRITE_TIMEOUT = 100_000_000  # nanoseconds that a reliable writer may wait for slow readers
-
-
-def user_data(pairs: dict[str, str]) -> bytes:
-    """USER_DATA as the middlewares of ROS 2 write it: key=value;key=value;"""
-    return "".join(f"{key}={value};" for key, value in pairs.items()).encode()
-
-
-def parse_user_data(data: bytes) -> dict[str, str]:
-    """The other way round; what is not of that form is left out."""
-    pairs = (part.partition("=") for part in data.decode("utf-8", "replace").split(";"))
-    return {key: value for key, equals, value in pairs if equals}
+_AT_ONCE = 16
 
 
 class Reader:
@@ -50,7 +38,7 @@ class Reader:
         self.ignored = 0
         self._deliver = deliver
         self._proxies: dict[int, bool] = {}
-        self.dds = DataReader(domain.participant, domain.topic(channel), qos=_dds_qos(qos, pairs, writes=False))
+        self.dds = DataReader(domain.participant, domain.topic(channel), qos=dds_qos(qos, pairs, writes=False))
         self._condition = ReadCondition(self.dds, ViewState.Any | SampleState.Any | InstanceState.Any)
         self._waitset: Any = None
 
@@ -65,8 +53,8 @@ class Reader:
 
     def drain(self) -> None:
         """Take all that is there, as long as it is wanted."""
-        while self._deliver.ready():
-            samples = dds_raw.take(self.dds)
+        while room := self._deliver.room():
+            samples = dds_raw.take(self.dds, min(room, _AT_ONCE))
             for sample in samples:
                 if self._from_proxy(sample.writer):
                     self.ignored += 1
@@ -76,6 +64,12 @@ class Reader:
                 return
 
     @property
+    def incompatible(self) -> tuple[int, str]:
+        """How many writers offer less than this asks for, and which policy of the last of them."""
+        status = self.dds.get_requested_incompatible_qos_status()
+        return status.total_count, policy_name(status.last_policy_id)
+
+    @property
     def matched(self) -> int:
         """How many writers there are."""
         return len(self.dds.get_matched_publications())
@@ -83,12 +77,16 @@ class Reader:
     @property
     def ready(self) -> bool:
         """Is there room for more?"""
-        return self._deliver.ready()
+        return self._deliver.room() > 0
 
     def _from_proxy(self, writer: int) -> bool:
         known = self._proxies.get(writer)
         if known is None:
             known = self._proxies[writer] = bool(self._mark_of(writer))
+            if known:
+                log.warning(
+                    "another proxy writes %s here; if it brings the same, everything comes twice", self.channel.topic
+                )
             if len(self._proxies) > 10_000:  # writers come and go for months
                 self._proxies = {writer: known}
         return known
@@ -100,14 +98,14 @@ class Reader:
             found = self.dds.get_matched_publication_data(writer)
         except DDSException:  # it has left already; it is taken for an application
             return ""
-        return _mark(found.qos) if found is not None else ""
+        return mark_of(found.qos) if found is not None else ""
 
 
 class _Deliver:
-    """What a reader's samples go to: `put` each; `ready` says whether it has room."""
+    """What a reader's samples go to: `put` each; `room` says how many more it takes now."""
 
-    def __init__(self, put: Callable[[bytes], None], ready: Callable[[], bool]) -> None:
-        self.put, self.ready = put, ready
+    def __init__(self, put: Callable[[bytes], None], room: Callable[[], int]) -> None:
+        self.put, self.room = put, room
 
 
 class Writer:
@@ -118,11 +116,17 @@ class Writer:
 
         self.channel = channel
         marked = {**pairs, MARK: domain.mark}
-        self.dds = DataWriter(domain.participant, domain.topic(channel), qos=_dds_qos(qos, marked, writes=True))
+        self.dds = DataWriter(domain.participant, domain.topic(channel), qos=dds_qos(qos, marked, writes=True))
 
     def write(self, *parts: bytes) -> bool:
         """Write one sample given in pieces; see `dds_raw.write`."""
         return dds_raw.write(self.dds, *parts)
+
+    @property
+    def incompatible(self) -> tuple[int, str]:
+        """How many readers ask for more than this offers, and which policy of the last of them."""
+        status = self.dds.get_offered_incompatible_qos_status()
+        return status.total_count, policy_name(status.last_policy_id)
 
     @property
     def matched(self) -> int:
@@ -136,17 +140,24 @@ class Domain:
     Args:
         number: of the domain, ROS_DOMAIN_ID.
         mark: identifies the proxy to others, from which domain ever; no secret.
+
+    Raises:
+        MissingExtraError: cyclonedds is not installed.
+        ConfigError: Cyclone DDS cannot join, for instance as it finds no network interface.
     """
 
     def __init__(self, number: int, mark: str = "") -> None:
         try:
-            from cyclonedds.core import GuardCondition, WaitSet
+            from cyclonedds.core import DDSException, GuardCondition, WaitSet
             from cyclonedds.domain import DomainParticipant
         except ImportError:
             raise MissingExtraError("cyclonedds", "ros2") from None
         self.number = number
         self.mark = mark or uuid.uuid4().hex
-        self.participant = DomainParticipant(number)
+        try:
+            self.participant = DomainParticipant(number)
+        except DDSException as error:
+            raise ConfigError(f"DDS domain {number} cannot be joined ({error}); is CYCLONEDDS_URI right?") from None
         self._topics: dict[Channel, Any] = {}
         self._readers: list[Reader] = []
         self._lock = threading.Lock()
@@ -169,15 +180,15 @@ class Domain:
         qos: QosProfile,
         put: Callable[[bytes], None],
         *,
-        ready: Callable[[], bool] = lambda: True,
+        room: Callable[[], int] = lambda: _AT_ONCE,
         pairs: dict[str, str] | None = None,
     ) -> Reader:
         """Read a topic: `put` gets each sample that no proxy has written, on the domain's thread, so it must not block.
 
-        ready: while it is false, samples stay with DDS; `wake` tells that it has become true.
+        room: for how many samples there is room; others stay with DDS. `wake` tells that there is room again.
         pairs: for USER_DATA.
         """
-        reader = Reader(self, channel, qos, pairs or {}, _Deliver(put, ready))
+        reader = Reader(self, channel, qos, pairs or {}, _Deliver(put, room))
         with self._lock:
             self._readers.append(reader)
         self.wake()
@@ -217,37 +228,6 @@ class Domain:
             for reader in readers:
                 try:
                     reader.drain()
-                except OSError as error:
+                except Exception:  # one topic's trouble is not the others'
                     if not self._stop:
-                        log.error("domain %d, %s: %s", self.number, reader.channel.topic, error)
-
-
-def _mark(qos: Any) -> str:
-    from cyclonedds.core import Policy
-
-    policy = qos[Policy.Userdata] if Policy.Userdata in qos else None  # noqa: SIM401 - a Qos has no get
-    return parse_user_data(bytes(policy.data)).get(MARK, "") if policy is not None else ""
-
-
-def _dds_qos(profile: QosProfile, pairs: dict[str, str], *, writes: bool) -> Any:
-    """The profile as Cyclone DDS's. Lifespan and deadline are promises of writers; a reader that asks for none fits all."""
-    from cyclonedds.core import Policy, Qos
-
-    keep_all = profile.history == "keep_all"
-    history = Policy.History.KeepAll if keep_all else Policy.History.KeepLast(profile.depth)
-    reliable = profile.reliability == "reliable"
-    policies: list[Any] = [
-        history,
-        Policy.Reliability.Reliable(_WRITE_TIMEOUT) if reliable else Policy.Reliability.BestEffort,
-        Policy.Userdata(user_data(pairs)),
-        Policy.IgnoreLocal.Participant,
-    ]
-    if profile.durability == "transient_local":
-        policies += [Policy.Durability.TransientLocal, Policy.DurabilityService(0, history, -1, -1, -1)]
-    if writes:
-        policies.append(Policy.WriterDataLifecycle(autodispose=False))
-        if profile.lifespan is not None:
-            policies.append(Policy.Lifespan(round(profile.lifespan * 1e9)))
-        if profile.deadline is not None:
-            policies.append(Policy.Deadline(round(profile.deadline * 1e9)))
-    return Qos(*policies)
+                        log.exception("domain %d, %s", self.number, reader.channel.topic)

@@ -99,7 +99,11 @@ class Gateway:
             )
         self._server = grpc.aio.server(
             interceptors=(_token_check(self._token),) if self._token is not None else (),
-            options=(("grpc.max_receive_message_length", MAX_MESSAGE), ("grpc.max_send_message_length", MAX_MESSAGE)),
+            options=(
+                ("grpc.max_receive_message_length", MAX_MESSAGE),
+                ("grpc.max_send_message_length", MAX_MESSAGE),
+                ("grpc.so_reuseport", 0),  # or a second gateway would share the port, and the clients, unnoticed
+            ),
             maximum_concurrent_rpcs=MAX_CALLS,
         )
         self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))

@@ -19,6 +19,7 @@ class BoundedQueue(Generic[T]):
     """
 
     def __init__(self, size: int) -> None:
+        self._size = size
         self._items: deque[T] = deque(maxlen=size)
         self._changed = threading.Condition()
         self._closed = False
@@ -47,9 +48,9 @@ class BoundedQueue(Generic[T]):
             self._changed.notify_all()
 
     @property
-    def full(self) -> bool:
-        """Would the next item push out another one?"""
-        return len(self._items) == self._items.maxlen
+    def room(self) -> int:
+        """How many more items fit."""
+        return self._size - len(self._items)
 
     def __len__(self) -> int:
         return len(self._items)

@@ -24,10 +24,10 @@ def full_name(name: str) -> str:
     Raises:
         ConfigError: not a name that ROS 2 accepts.
     """
-    name = name if name.startswith("/") else f"/{name}"
-    if len(name) > MAX_NAME or not _NAME.fullmatch(name) or "__" in name:
+    full = name if name.startswith("/") else f"/{name}"
+    if len(full) > MAX_NAME or not _NAME.fullmatch(full) or "__" in full:
         raise ConfigError(f"{name[:60]!r} is not a ROS 2 name; names are like /arm/joint_states")
-    return name
+    return full
 
 
 def full_type(type_name: str, kind: str = "msg") -> str:

@@ -73,6 +73,12 @@ class Client:
             thread.start()
         self._reader = domain.reader(requests, route.qos, self._queue.put, pairs=ids)
 
+    @property
+    def incompatible(self) -> tuple[int, str]:
+        """See `Reader.incompatible`."""
+        here: tuple[int, str] = max(self._reader.incompatible, self._writer.incompatible)
+        return here
+
     def counters(self) -> dict[str, int]:
         """Requests, and what became of them."""
         return self._counts.as_dict(requests_dropped=self._queue.dropped)
@@ -117,6 +123,12 @@ class Server:
         self._reader = domain.reader(replies, route.qos, self._on_reply, pairs=ids)
         self._writer = domain.writer(requests, route.qos, ids)
         self._handle = node.serve(route.alias, self._on_request)
+
+    @property
+    def incompatible(self) -> tuple[int, str]:
+        """See `Reader.incompatible`."""
+        here: tuple[int, str] = max(self._reader.incompatible, self._writer.incompatible)
+        return here
 
     def counters(self) -> dict[str, int]:
         """Requests, and what became of them."""

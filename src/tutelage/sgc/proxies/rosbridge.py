@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 MAX_MESSAGE = 32 << 20
 """Bytes of one message from a client."""
 MAX_CLIENTS = 256
+_POLITELY = 2.0  # seconds for clients to say goodbye when the bridge closes
 _CALLS = 64  # service calls of all clients that may block at a time
 
 
@@ -77,7 +78,7 @@ class Bridge:
         if len(self.topics) < len(routes.topics) or len(self.services) < len(routes.services):
             raise ConfigError("two routes have the same name; a rosbridge has only one of each")
         self._token, self._origins = token, set(origins)
-        self._clients = 0
+        self._connections: set[Any] = set()
         self._server: Any = None
         self._thread = threading.Thread(target=self.loop.run_forever, name="rosbridge", daemon=True)
         self._thread.start()
@@ -97,7 +98,7 @@ class Bridge:
         """What was counted: for the bridge, and topics/<alias>/..."""
         topics = {t.route.alias: t.counts.as_dict(dropped=t.dropped) for t in self.topics.values()}
         services = {s.route.alias: s.counts.as_dict() for s in self.services.values()}
-        return {**self.counts.as_dict(connected=self._clients), "topics": {**topics, **services}}
+        return {**self.counts.as_dict(connected=len(self._connections)), "topics": {**topics, **services}}
 
     def close(self) -> None:
         """Disconnect everybody and stop."""
@@ -124,6 +125,7 @@ class Bridge:
                 process_request=self._admit,
                 max_size=self.max_message,
                 max_queue=4,
+                close_timeout=1,
                 compression=None,
                 ssl=_ssl(tls) if tls is not None else None,
                 logger=logging.getLogger(f"{__name__}.websockets"),
@@ -135,7 +137,7 @@ class Bridge:
 
     def _admit(self, connection: Any, request: Any) -> Any:
         """None: come in; otherwise the refusal."""
-        if self._clients >= MAX_CLIENTS:
+        if len(self._connections) >= MAX_CLIENTS:
             return self._refuse(connection, http.HTTPStatus.SERVICE_UNAVAILABLE, "too many clients")
         origins = request.headers.get_all("Origin")
         if any(not self._known_origin(origin) for origin in origins):
@@ -165,7 +167,7 @@ class Bridge:
     async def _serve(self, connection: Any) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        self._clients += 1
+        self._connections.add(connection)
         self.counts.add("clients")
         session = Session(self)
         writer = self.loop.create_task(self._write(connection, session))
@@ -173,13 +175,14 @@ class Bridge:
             async for frame in connection:
                 self.counts.add("messages")
                 await session.handle(frame)
+                await session.outbox.room()
         except TooSlow:
             self.counts.add("too_slow")
-            await connection.close(1008, "answers are not read")
+            connection.transport.abort()  # to close politely, the other side would have to read
         except ConnectionClosed:
             pass
         finally:
-            self._clients -= 1
+            self._connections.discard(connection)
             writer.cancel()
             await session.close()
             self.counts.add("dropped", session.outbox.dropped)
@@ -196,7 +199,12 @@ class Bridge:
 
     async def _stop(self) -> None:
         self._server.close()
-        await self._server.wait_closed()
+        try:
+            await asyncio.wait_for(asyncio.shield(self._server.wait_closed()), _POLITELY)
+        except TimeoutError:
+            for connection in self._connections:
+                connection.transport.abort()
+            await self._server.wait_closed()
         for topic in self.topics.values():
             await topic.close()
 

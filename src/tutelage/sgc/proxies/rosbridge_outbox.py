@@ -19,6 +19,8 @@ Frames = Sequence[Frame]
 """A message: one frame, or its fragments."""
 MAX_CONTROL = 256
 """Replies and status messages that may wait. A client that lets more pile up does not read; it is disconnected."""
+PATIENCE = 5.0
+"""Seconds that a client may leave replies unread."""
 SEND_QUEUE = 64
 """Messages of a subscription that may wait for a slow client."""
 MAX_QUEUE = 1000
@@ -38,6 +40,7 @@ class Outbox:
         self._control: deque[Frame] = deque()
         self._turns: deque[deque[Frames]] = deque()
         self._filled = asyncio.Event()
+        self._read = asyncio.Event()
         self.dropped = 0
 
     def control(self, frame: Frame) -> None:
@@ -60,10 +63,24 @@ class Outbox:
         queue.append(frames)
         self._filled.set()
 
+    async def room(self) -> None:
+        """Wait while many replies wait: nothing more is to be read from a client that does not read.
+
+        Raises:
+            TooSlow: they wait for too long.
+        """
+        while len(self._control) > MAX_CONTROL // 4:
+            self._read.clear()
+            try:
+                await asyncio.wait_for(self._read.wait(), PATIENCE)
+            except TimeoutError:
+                raise TooSlow from None
+
     async def get(self) -> Frames:
         """The next message to send; replies first."""
         while True:
             if self._control:
+                self._read.set()
                 return (self._control.popleft(),)
             while self._turns:
                 queue = self._turns.popleft()

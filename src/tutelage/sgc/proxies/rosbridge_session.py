@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from tutelage.errors import ConfigError, TutelageError
+from tutelage.errors import TutelageError
 from tutelage.sgc.proxies.ros_names import full_name, full_type
-from tutelage.sgc.proxies.rosbridge_outbox import MAX_QUEUE, ClientSubscription, Outbox, TooSlow, Wish
+from tutelage.sgc.proxies.rosbridge_outbox import ClientSubscription, Outbox, TooSlow
+from tutelage.sgc.proxies.rosbridge_requests import MAX_ID, BadRequest, ident_of, parse, text_of, wish_of
 from tutelage.sgc.proxies.rosbridge_services import Service, ServiceFailed, rosapi
 from tutelage.sgc.proxies.rosbridge_topics import Topic
 from tutelage.sgc.proxies.rosbridge_wire import Defragmenter, dump_json
@@ -22,12 +22,6 @@ MAX_CALLS = 32
 """Service calls of one client that may be under way."""
 MAX_WISHES = 64
 """Subscriptions that one client may hold on one topic."""
-MAX_ID = 200
-_COMPRESSIONS = ("none", "png", "cbor", "cbor-raw")
-
-
-class BadRequest(TutelageError):
-    """A message of a client that cannot be obeyed."""
 
 
 class Session:
@@ -67,7 +61,7 @@ class Session:
             TooSlow: the client does not read its answers.
         """
         try:
-            message = _parse(frame)
+            message = parse(frame)
         except BadRequest as error:
             self._bridge.counts.add("refused")
             self.status("error", str(error))
@@ -83,7 +77,7 @@ class Session:
             await operation(message)
         except TutelageError as error:
             self._bridge.counts.add("refused")
-            self.status("error", str(error), _ident(message))
+            self.status("error", str(error), ident_of(message))
 
     def status(self, level: str, text: str, ident: Any = None) -> None:
         """Tell the client, if it wants to know things of that level.
@@ -120,26 +114,26 @@ class Session:
     # --- topics
 
     def _topic(self, message: dict[str, Any]) -> Topic:
-        name = full_name(_text(message, "topic"))
+        name = full_name(text_of(message, "topic"))
         topic = self._bridge.topics.get(name)
         if topic is None:
             raise BadRequest(f"there is no topic {name} here; there are {', '.join(self._bridge.topics) or 'none'}")
         given = message.get("type")
-        if given is not None and full_type(_text(message, "type")) != topic.route.type:
+        if given is not None and full_type(text_of(message, "type")) != topic.route.type:
             raise BadRequest(f"topic {name} is of type {topic.route.type}, not {given}")
         return topic
 
     async def _advertise(self, message: dict[str, Any]) -> None:
         topic = self._topic(message)
         self._may_publish(topic)
-        _text(message, "type")
+        text_of(message, "type")
         self._advertised.add(topic.route.name)
-        self.status("info", f"{topic.route.name} is advertised", _ident(message))
+        self.status("info", f"{topic.route.name} is advertised", ident_of(message))
 
     async def _unadvertise(self, message: dict[str, Any]) -> None:
         name = self._topic(message).route.name
         if name not in self._advertised:
-            self.status("warning", f"{name} was not advertised", _ident(message))
+            self.status("warning", f"{name} was not advertised", ident_of(message))
         self._advertised.discard(name)
 
     async def _publish(self, message: dict[str, Any]) -> None:
@@ -155,7 +149,7 @@ class Session:
         topic = self._topic(message)
         if not topic.route.inward:
             raise BadRequest(f"clients may not subscribe to {topic.route.name}: the policy or the routes do not allow it")
-        wish = _wish(message)
+        wish = wish_of(message)
         if wish.compression != "cbor-raw":
             _ = topic.codec  # now, not with each message: is the type known?
         subscription = self._subscriptions.get(topic.route.name)
@@ -165,14 +159,14 @@ class Session:
             self._subscriptions[topic.route.name] = subscription
         elif len(subscription.wishes) >= MAX_WISHES:
             raise BadRequest(f"more than {MAX_WISHES} subscriptions to {topic.route.name}")
-        subscription.wish(_ident(message), wish)
-        self.status("info", f"subscribed to {topic.route.name}", _ident(message))
+        subscription.wish(ident_of(message), wish)
+        self.status("info", f"subscribed to {topic.route.name}", ident_of(message))
 
     async def _unsubscribe(self, message: dict[str, Any]) -> None:
         name = self._topic(message).route.name
         if name not in self._subscriptions:
-            self.status("warning", f"not subscribed to {name}", _ident(message))
-        elif self._subscriptions[name].forget(_ident(message)):
+            self.status("warning", f"not subscribed to {name}", ident_of(message))
+        elif self._subscriptions[name].forget(ident_of(message)):
             await self._drop(name)
 
     async def _drop(self, name: str) -> None:
@@ -185,12 +179,12 @@ class Session:
     # --- services
 
     def _service(self, message: dict[str, Any]) -> Service:
-        name = full_name(_text(message, "service"))
+        name = full_name(text_of(message, "service"))
         service = self._bridge.services.get(name)
         if service is None:
             raise BadRequest(f"there is no service {name} here; there are {', '.join(self._bridge.services) or 'none'}")
         given = message.get("type")
-        if given is not None and full_type(_text(message, "type"), "srv") != service.route.type:
+        if given is not None and full_type(text_of(message, "type"), "srv") != service.route.type:
             raise BadRequest(f"service {name} is of type {service.route.type}, not {given}")
         return service
 
@@ -206,7 +200,7 @@ class Session:
         reply: dict[str, Any] = {"op": "service_response", "service": name, "result": True}
         arguments = message.get("args", {})
         try:
-            if full_name(_text(message, "service")).startswith("/rosapi/"):
+            if full_name(text_of(message, "service")).startswith("/rosapi/"):
                 reply["values"] = rosapi(full_name(name), arguments, self._bridge.routes)
             else:
                 timeout = message.get("timeout")
@@ -216,7 +210,7 @@ class Session:
             self._bridge.counts.add("refused")
             reply.update(result=False, values=str(error))
         try:
-            self._reply(reply, _ident(message))
+            self._reply(reply, ident_of(message))
         except TooSlow:
             self._bridge.counts.add("refused")
 
@@ -229,14 +223,14 @@ class Session:
     async def _unadvertise_service(self, message: dict[str, Any]) -> None:
         service = self._service(message)
         if service.provider is not self:
-            self.status("warning", f"{service.route.name} was not advertised", _ident(message))
+            self.status("warning", f"{service.route.name} was not advertised", ident_of(message))
         await asyncio.to_thread(service.unadvertise, self)
 
     async def _service_response(self, message: dict[str, Any]) -> None:
         service = self._service(message)
         if service.provider is not self:
             raise ServiceFailed(f"{service.route.name} is not answered for by this client")
-        service.answer(str(_ident(message)), message.get("values"), message.get("result") is not False)
+        service.answer(str(ident_of(message)), message.get("values"), message.get("result") is not False)
 
     # --- the protocol itself
 
@@ -246,7 +240,7 @@ class Session:
         except ValueError as error:
             raise BadRequest(str(error)) from None
         if text is not None:
-            inner = _parse(text)
+            inner = parse(text)
             if inner["op"] == "fragment":
                 raise BadRequest("fragments within fragments")
             await self._obey(inner)
@@ -259,47 +253,3 @@ class Session:
 
     async def _status(self, message: dict[str, Any]) -> None:
         """A client's own status messages need no answer."""
-
-
-def _parse(frame: str | bytes) -> dict[str, Any]:
-    if isinstance(frame, bytes):
-        raise BadRequest("binary frames (BSON) are not understood; send JSON as text")
-    try:
-        message = json.loads(frame)
-    except (ValueError, RecursionError) as error:
-        raise BadRequest(f"not JSON: {str(error)[:100]}") from None
-    if not isinstance(message, dict) or not isinstance(message.get("op"), str):
-        raise BadRequest('a message is an object with "op"')
-    return message
-
-
-def _ident(message: dict[str, Any]) -> Any:
-    ident = message.get("id")
-    if isinstance(ident, str):
-        return ident[:MAX_ID]
-    return ident if isinstance(ident, int) and abs(ident) < 2**63 else None
-
-
-def _text(message: dict[str, Any], key: str) -> str:
-    value = message.get(key)
-    if not isinstance(value, str):
-        raise BadRequest(f"{message['op']} needs {key}, a text")
-    return value
-
-
-def _wish(message: dict[str, Any]) -> Wish:
-    def number(key: str, highest: int) -> int:
-        value = message.get(key) or 0
-        if not isinstance(value, int | float) or not 0 <= value <= highest:
-            raise BadRequest(f"{key} must be a number from 0 to {highest}")
-        return int(value)
-
-    compression = message.get("compression") or "none"
-    if compression not in _COMPRESSIONS:
-        raise ConfigError(f"compression must be one of {', '.join(_COMPRESSIONS)}")
-    return Wish(
-        throttle=number("throttle_rate", 86_400_000) / 1000,
-        queue=min(number("queue_length", 2**31), MAX_QUEUE),
-        fragment=number("fragment_size", 2**31) or None,
-        compression=compression,
-    )

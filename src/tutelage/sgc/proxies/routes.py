@@ -25,8 +25,9 @@ type = "example_interfaces/action/Fibonacci"
 
 from __future__ import annotations
 
+import logging
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,10 @@ from typing import Any
 from tutelage.errors import ConfigError
 from tutelage.sgc.access import Access, Delivery, Kind, Lane
 from tutelage.sgc.proxies.ros_names import full_name, full_type
-from tutelage.sgc.proxies.ros_qos import PROFILES, QosProfile, parse_qos
+from tutelage.sgc.proxies.ros_qos import PROFILES, QosProfile
+from tutelage.sgc.proxies.toml_table import Table
 
+log = logging.getLogger(__name__)
 MAX_DOMAIN = 232
 """The highest DDS domain for which there are UDP ports."""
 MAX_QUEUE = 100_000
@@ -113,14 +116,14 @@ def load_routes(path: Path, access: Access) -> Routes:
 
 def parse_routes(content: Mapping[str, Any], access: Access) -> Routes:
     """See `load_routes`."""
-    table = _Table(dict(content), "the file")
+    table = Table(dict(content), "the file")
     if table.take("version", int) != 1:
         raise ConfigError("version must be 1")
     distribution = table.take("distribution", str, "")
-    topics = [_topic(_Table(entry, "a topic"), access) for entry in table.tables("topic")]
-    services = [_service(_Table(entry, "a service"), access) for entry in table.tables("service")]
+    topics = [_topic(Table(entry, "a topic"), access) for entry in table.tables("topic")]
+    services = [_service(Table(entry, "a service"), access) for entry in table.tables("service")]
     for entry in table.tables("action"):
-        more_topics, more_services = _action(_Table(entry, "an action"), access)
+        more_topics, more_services = _action(Table(entry, "an action"), access)
         topics += more_topics
         services += more_services
     table.finish()
@@ -132,61 +135,22 @@ def parse_routes(content: Mapping[str, Any], access: Access) -> Routes:
 def all_routes(access: Access) -> Routes:
     """Everything that the policy gives this node a part in, under the policy's own names.
 
-    Raises:
-        ConfigError: the policy's interface or type is none that ROS 2 knows; name it in a file of routes instead.
+    Topics whose interface or type ROS 2 does not know are left out, with a warning; a file of routes can name them.
     """
-    entries = [{"alias": alias} for alias, entry in access.topics.items() if entry.rule.kind is Kind.STREAM]
-    services = [
-        {"alias": alias, "direction": "out" if entry.rule.may_receive(access.node, Lane.REQUEST) else "in"}
-        for alias, entry in access.topics.items()
-        if entry.rule.kind is Kind.SERVICE
-    ]
-    return parse_routes({"version": 1, "topic": entries, "service": services}, access)
+    topics, services = [], []
+    for alias, entry in access.topics.items():
+        try:
+            if entry.rule.kind is Kind.STREAM:
+                topics.append(_topic(Table({"alias": alias}, "a topic"), access))
+            else:
+                direction = "out" if entry.rule.may_receive(access.node, Lane.REQUEST) else "in"
+                services.append(_service(Table({"alias": alias, "direction": direction}, "a service"), access))
+        except ConfigError as error:
+            log.warning("left out: %s", error)
+    return Routes(tuple(topics), tuple(services))
 
 
-class _Table:
-    """A TOML table that is taken apart; what is left over at the end is unknown."""
-
-    def __init__(self, content: Any, what: str) -> None:
-        if not isinstance(content, dict):
-            raise ConfigError(f"{what} must be a table, not {content!r}")
-        self._left = dict(content)
-        alias = content.get("alias")
-        self.what = f"{what.split()[-1]} {alias}" if isinstance(alias, str) else what
-
-    def take(self, key: str, kind: type | tuple[type, ...], *default: Any) -> Any:
-        """A setting of that kind; without a default it must be there."""
-        if key not in self._left:
-            if default:
-                return default[0]
-            raise ConfigError(f"{self.what} needs {key}")
-        value = self._left.pop(key)
-        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise ConfigError(f"{self.what}: {key} cannot be {value!r}")
-        return value
-
-    def tables(self, key: str) -> Iterator[Any]:
-        """The tables of a [[key]]."""
-        yield from self.take(key, list, [])
-
-    def qos(self, default: str) -> QosProfile:
-        """The quality of service."""
-        return parse_qos(self._left.pop("qos", default), self.what)
-
-    def number(self, key: str, default: float, low: float, high: float, kind: type | tuple[type, ...] = int) -> Any:
-        """A number in a range."""
-        value = self.take(key, kind, default)
-        if not low <= value <= high:
-            raise ConfigError(f"{self.what}: {key} must be from {low:g} to {high:g}, not {value!r}")
-        return value
-
-    def finish(self) -> None:
-        """Refuse what is left over."""
-        if self._left:
-            raise ConfigError(f"{self.what}: unknown setting {', '.join(sorted(self._left))}")
-
-
-def _topic(table: _Table, access: Access) -> TopicRoute:
+def _topic(table: Table, access: Access) -> TopicRoute:
     alias = table.take("alias", str)
     rule = access.entry(alias).rule
     if rule.kind is not Kind.STREAM:
@@ -219,7 +183,7 @@ def _topic(table: _Table, access: Access) -> TopicRoute:
     return route
 
 
-def _service(table: _Table, access: Access) -> ServiceRoute:
+def _service(table: Table, access: Access) -> ServiceRoute:
     alias = table.take("alias", str)
     rule = access.entry(alias).rule
     if rule.kind is not Kind.SERVICE:
@@ -244,14 +208,14 @@ def _service(table: _Table, access: Access) -> ServiceRoute:
     return route
 
 
-def _name(table: _Table, default: str) -> str:
+def _name(table: Table, default: str) -> str:
     try:
         return full_name(table.take("name", str, default))
     except ConfigError as error:
         raise ConfigError(f"{table.what}: {error}; give it a name in the file of routes") from None
 
 
-def _type(table: _Table, default: str, kind: str) -> str:
+def _type(table: Table, default: str, kind: str) -> str:
     given = table.take("type", str, default)
     try:
         return full_type(given, "action" if "/action/" in given else kind)  # the parts of an action are of its own kind
@@ -259,7 +223,7 @@ def _type(table: _Table, default: str, kind: str) -> str:
         raise ConfigError(f"{table.what}: {error}") from None
 
 
-def _action(table: _Table, access: Access) -> tuple[list[TopicRoute], list[ServiceRoute]]:
+def _action(table: Table, access: Access) -> tuple[list[TopicRoute], list[ServiceRoute]]:
     """The three services and two topics that a ROS 2 action is made of."""
     alias = table.take("alias", str)
     name = full_name(table.take("name", str))
@@ -270,9 +234,9 @@ def _action(table: _Table, access: Access) -> tuple[list[TopicRoute], list[Servi
     table.finish()
     common = {"direction": direction, "domain": domain}
 
-    def part(suffix: str, kind: str, **settings: Any) -> _Table:
+    def part(suffix: str, kind: str, **settings: Any) -> Table:
         given = {"alias": f"{alias}-{suffix}", "name": f"{name}/_action/{suffix}", **common, **settings}
-        return _Table(given, kind)
+        return Table(given, kind)
 
     services = [
         _service(part("send_goal", "a service", type=f"{action}_SendGoal"), access),
