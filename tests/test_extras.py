@@ -47,3 +47,17 @@ def test_what_needs_an_extra_names_it(missing: str, verb: str, extra: str, tmp_p
     assert said.stderr.count("\n") == 1
     assert f"pip install 'tutelage[{extra}]'" in said.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("verb", ["keys", "router", "proxy", "ping", "top"])
+def test_connectivity_loads_no_learning_library(verb: str, tmp_path: Path) -> None:
+    code = f"""
+import contextlib
+from tutelage.cli import main
+with contextlib.suppress(SystemExit):
+    main(["{verb}", "--help"])
+assert not {{"torch", "numpy", "gymnasium"}} & set(sys.modules)
+"""
+    said = python(code, tmp_path, [])
+    assert said.returncode == 0, said.stderr
+    assert f"usage: tutelage {verb}" in said.stdout

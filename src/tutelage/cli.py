@@ -22,7 +22,6 @@ from tyro.conf import Positional, arg
 
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
-from tutelage.experiments.config import ExpertConfig, RunConfig
 from tutelage.sgc.commands import keys, proxy
 from tutelage.sgc.commands.ping import ping
 from tutelage.sgc.commands.router import router
@@ -31,6 +30,7 @@ from tutelage.sgc.commands.top import top
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from tutelage.experiments.config import ExpertConfig, RunConfig
     from tutelage.experiments.run import Run
     from tutelage.fleet.loop import Loop
     from tutelage.fleet.step import Subscriber
@@ -297,21 +297,6 @@ def _print_table(head: list[str], rows: list[list[str]]) -> None:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of `tutelage`: exits with 0, or with 2 and one clear line."""
-    verbs: dict[str, Any] = {
-        "run": run,
-        "resume": resume,
-        "evaluate": evaluate,
-        "report": report,
-        "reproduce": reproduce,
-        "train-expert": train_expert,
-        "check": check,
-        "info": info,
-        "keys": keys,
-        "router": router,
-        "proxy": proxy,
-        "ping": ping,
-        "top": top,
-    }
     arguments = list(sys.argv[1:] if args is None else args)
     if arguments == ["--version"]:
         print(f"tutelage {__version__}")
@@ -319,6 +304,8 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # so that module:callable finds a file of the user's in the present folder
     try:
+        connectivity = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
+        verbs = connectivity if arguments[:1] and arguments[0] in connectivity else _learning_verbs() | connectivity
         _parse(verbs, arguments)()
         sys.stdout.flush()
     except TutelageError as error:
@@ -330,6 +317,24 @@ def main(args: Sequence[str] | None = None) -> None:
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
+
+
+def _learning_verbs() -> dict[str, Any]:
+    """The verbs that need PyTorch, which takes seconds and memory that a router or robot may not have."""
+    from tutelage.experiments import config
+
+    # The parser looks up annotations among this module's names.
+    globals().update(RunConfig=config.RunConfig, ExpertConfig=config.ExpertConfig)
+    return {
+        "run": run,
+        "resume": resume,
+        "evaluate": evaluate,
+        "report": report,
+        "reproduce": reproduce,
+        "train-expert": train_expert,
+        "check": check,
+        "info": info,
+    }
 
 
 def _parse(

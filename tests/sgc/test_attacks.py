@@ -12,7 +12,7 @@ from members import Fleet
 
 from tutelage.seeding import derive
 from tutelage.sgc.keyring import Keyring
-from tutelage.sgc.packet import BODY, HEADER, MAX_PACKET, PROOF, nonce, read_header
+from tutelage.sgc.packet import BODY, HEADER, MAX_PACKET, PROOF, make_header, nonce, read_header
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.sealing import Opener, Sealer
 
@@ -71,7 +71,7 @@ def header(packets: list[bytes], dice: random.Random) -> bytes:
         "sent": dice.choice([0, fields.sent + 1, 2**63, 2**64 - 1]),
     }  # fmt: skip
     chosen = dice.sample(sorted(changes), dice.randrange(1, 4))
-    return fields._replace(**{name: changes[name] for name in chosen}).pack() + packet[HEADER:]
+    return make_header(*fields._replace(**{name: changes[name] for name in chosen})) + packet[HEADER:]
 
 
 def splice(packets: list[bytes], dice: random.Random) -> bytes:
@@ -215,7 +215,7 @@ def test_a_signed_message_cannot_be_sealed_again_for_another_place(fleet: Fleet)
     cipher = sealer._cipher  # members can derive it
     assert cipher is not None
     signature = cipher.decrypt(nonce(PROOF, packet), packet[-80:], packet[:HEADER])
-    again = fields._replace(first=fields.first + 1).pack()
+    again = make_header(*fields._replace(first=fields.first + 1))
     body = cipher.encrypt(nonce(BODY, again), b"go", again)
     with pytest.raises(Refused) as raised:
         opener.open(again + body + cipher.encrypt(nonce(PROOF, again), signature, again))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import shutil
 import stat
 import threading
 import time
@@ -14,7 +15,7 @@ from members import POLICY, Fleet
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.authority import Authority
-from tutelage.sgc.errors import KeysError
+from tutelage.sgc.errors import KeysError, NotIssued
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import Role
@@ -58,6 +59,35 @@ def test_a_renewed_authority_is_believed_beside_the_old_one(fleet: Fleet) -> Non
     drone.accept(fleet.authority.renew(drone.request()))
     assert server.trust.verify(drone.credential).node == "drone-1"
     assert drone.trust.verify(server.credential).node == "server"  # still under the old certificate
+
+
+def test_a_stolen_authority_is_replaced_by_the_root_and_the_thief_loses_the_last_word(fleet: Fleet, tmp_path) -> None:
+    shutil.copytree(fleet.authority.path, tmp_path / "loot", ignore=shutil.ignore_patterns("root"))
+    thief = Authority.open(tmp_path / "loot")
+    drone, server = fleet.homes["drone-1"], fleet.homes["server"]
+    impostor = Home.create(tmp_path / "impostor", "server-2")
+    impostor.accept(thief.issue(impostor.request()))
+    assert server.trust.verify(impostor.credential).node == "server-2"
+    for _ in range(5):  # the thief's deny lists and policies have the higher serials
+        thief.publish()
+        member = Home.create(tmp_path / f"m{_}", f"m{_}")
+        thief.issue(member.request())
+        server.accept(thief.revoke(member.name))
+    time.sleep(1.0)  # certificates begin at whole seconds
+    fleet.authority.renew_own(revoke_old=True)
+    outbox = fleet.authority.path / "outbox"
+    for home in (drone, server):
+        home.accept((outbox / "deny").read_bytes())
+        with pytest.raises(NotIssued, match="is by an authority that was revoked; renew it"):
+            home.check()
+        home.accept((outbox / f"{home.name}.bundle").read_bytes())
+        home.check()
+    assert drone.trust.verify(server.credential).node == "server"
+    for refused, notice in ((impostor.credential, server.trust.verify), (thief.revoke("drone-1"), server.accept),
+                            (thief.publish()["server"], server.accept)):  # fmt: skip
+        with pytest.raises(Refused) as raised:
+            notice(refused)
+        assert raised.value.reason == Reason.REVOKED
 
 
 def test_another_fleets_root_cannot_renew_an_authority(fleet: Fleet, tmp_path) -> None:

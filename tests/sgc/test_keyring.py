@@ -159,11 +159,45 @@ def test_a_first_key_must_have_been_asked_for(fleet: Fleet) -> None:
     """A grant that a router kept and pushes to a node that knows nothing yet."""
     give(fleet, "server")
     push = next(push for push in fleet.keyrings["drone-1"].rotate("camera") if push.node == "server")
-    fresh = Keyring(fleet.homes["server"])
     (fleet.homes["server"].path / "keys" / "camera").unlink()
     fresh = Keyring(fleet.homes["server"])
+    assert reason(fresh.accept, "camera", push.grant) == Reason.NOT_FOR_US  # sealed to a key of the former start
+    fresh._reply_to = fleet.keyrings["server"]._reply_to
     assert reason(fresh.accept, "camera", push.grant) == Reason.REPLAYED
-    assert fresh.accept("camera", push.grant, by_hand=True)
+
+
+def test_keys_can_be_carried_by_file_between_programs_that_do_not_run_at_the_same_time(fleet: Fleet) -> None:
+    request = Keyring(fleet.homes["server"]).ask("camera", by_hand=True)
+    grant = Keyring(fleet.homes["drone-1"]).answer("camera", request)
+    later = Keyring(fleet.homes["server"])
+    assert reason(later.accept, "camera", grant) == Reason.NOT_FOR_US
+    assert later.accept("camera", grant, by_hand=True) == fleet.keyrings["drone-1"].epoch("camera")
+
+
+def test_who_steals_a_folder_cannot_read_grants_that_were_recorded(fleet: Fleet, monkeypatch) -> None:
+    clock = Clock(monkeypatch)
+    recorded = fleet.keyrings["drone-1"].answer("camera", fleet.keyrings["server"].ask("camera"))
+    fleet.keyrings["server"].accept("camera", recorded)
+    clock.pass_(3 * 3600)
+    fleet.keyrings["server"].tend()  # the key is over, and forgotten
+    thief = Keyring(Home.open(fleet.homes["server"].path))
+    assert thief.epoch("camera") is None
+    for by_hand in (False, True):
+        assert reason(thief.accept, "camera", recorded, by_hand=by_hand) == Reason.NOT_FOR_US
+
+
+def test_when_the_owner_is_revoked_its_keys_are_dropped(fleet: Fleet) -> None:
+    """It could read whatever is sealed under them."""
+    give(fleet, "server")
+    give(fleet, "drone-2")
+    restarted = Keyring(Home.open(fleet.homes["server"].path))
+    fleet.revoke("drone-1", tell=["server", "drone-2"])
+    restarted.tend()
+    for keyring in (fleet.keyrings["drone-2"], fleet.keyrings["server"], restarted):
+        with pytest.raises(NoKey, match="has no key for camera: drone-1 is revoked; name another owner in the policy"):
+            keyring.sealing("camera")
+    fleet.publish(POLICY.replace('owner = "drone-1"', 'owner = "drone-2"'))
+    assert give(fleet, "server") == fleet.keyrings["drone-2"].epoch("camera")
 
 
 def test_an_answer_is_taken_once_and_only_for_a_question(fleet: Fleet) -> None:

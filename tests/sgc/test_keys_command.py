@@ -98,6 +98,9 @@ def test_the_authority_is_renewed_by_the_offline_root(keys: Keys, fails: Keys) -
     assert "cannot read the root key" in fails("renew fleet --root-key vault/root.key")
     renewed = keys("renew fleet --root-key vault/root.key --passphrase-file secret")
     assert "the authority of acme has a new key, valid until" in renewed
+    stolen = keys("renew fleet --root-key vault/root.key --passphrase-file secret --revoke-old")
+    assert "what the old key signed is refused; carry the bundles in fleet/outbox to all nodes" in stolen
+    assert "revoked authority " in keys("show fleet")
 
 
 def test_what_is_shown_holds_no_secret(keys: Keys) -> None:

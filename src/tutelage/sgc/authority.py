@@ -26,7 +26,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from cryptography import x509
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from tutelage.files import Lock, write_atomic
@@ -37,34 +36,18 @@ from tutelage.sgc.certificates import raw
 from tutelage.sgc.envelope import derive
 from tutelage.sgc.errors import KeysError
 from tutelage.sgc.names import SECRET_BYTES, Name
-from tutelage.sgc.policy import Policy, routes
+from tutelage.sgc.policy import TEMPLATE, Policy, routes
+from tutelage.sgc.privatekeys import load_signing_key, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.roster import Roster
 from tutelage.sgc.rules import NODE_NAME, Role
 from tutelage.sgc.signed import sign
-from tutelage.sgc.trust import DENY_LIST, MEMBERSHIP, membership
+from tutelage.sgc.trust import DENY_LIST, MEMBERSHIP, fingerprint, membership
 from tutelage.sgc.wire import pack
 
 LEAF_HOURS = 24.0
 AUTHORITY_DAYS = 366.0
 ROOT_DAYS = 3660.0
-POLICY = """version = 1
-
-# Who may say and hear what. Without a table here nobody may do anything. After a change: tutelage keys issue FOLDER --policy
-#
-# renewals = "office"               # the node that renews certificates over the network: tutelage keys serve
-#
-# [topics.camera]
-# node = "drone-1"                  # metadata: its 256-bit name is made from it
-# interface = "/camera"
-# type = "sensor_msgs/msg/Image"
-# owner = "drone-1"                 # the node that hands out the topic's keys
-# publish = ["drone-1"]
-# subscribe = ["server", "operator-*"]
-# authenticity = "signature"        # or "session", "chain"
-# delivery = "lossy"                # or "reliable"
-# max_age = 0.5                     # seconds; commands should have one
-"""
 
 
 class Authority:
@@ -77,7 +60,7 @@ class Authority:
         try:
             self._roster = Roster.load(path / "state.json")
             self._secret = (path / "names.secret").read_bytes()
-            self._key = _load(path / "ca.key", None)
+            self._key = load_signing_key(path / "ca.key")
             self._certificate = x509.load_pem_x509_certificate((path / "ca.pem").read_bytes())
             self._root = x509.load_pem_x509_certificate((path / "root.pem").read_bytes())
             if len(self._secret) != SECRET_BYTES:
@@ -108,12 +91,12 @@ class Authority:
         root_key = Ed25519PrivateKey.generate()
         public, now = root_key.public_key(), time.time()
         root = certificates.authority_certificate(f"{fleet} root", public, None, root_key, now, ROOT_DAYS)
-        _save(path / "root" / "root.key", root_key, passphrase)
+        save_key(path / "root" / "root.key", root_key, passphrase)
         os.chmod(path / "root", 0o700)
         write_atomic(path / "root.pem", certificates.pem(root))
         write_atomic(path / "names.secret", secrets.token_bytes(SECRET_BYTES), private=True)
-        write_atomic(path / "policy.toml", POLICY.encode())
-        write_atomic(path / "published.toml", POLICY.encode())
+        write_atomic(path / "policy.toml", TEMPLATE.encode())
+        write_atomic(path / "published.toml", TEMPLATE.encode())
         _certify(path, fleet, root, root_key)
         Roster(path / "state.json", fleet).save()
         return cls(path)
@@ -152,17 +135,19 @@ class Authority:
         with self._lock:
             self._roster = Roster.load(self.path / "state.json")
 
-    def renew_own(self, root_key: Path | None = None, passphrase: bytes | None = None) -> None:
+    def renew_own(self, root_key: Path | None = None, passphrase: bytes | None = None, *, revoke_old: bool = False) -> None:
         """A new key and certificate for the authority itself; leaves that the old one signed stay valid until they expire.
 
         root_key: default: root/root.key in the folder.
+        revoke_old: the old key was stolen: whatever it signed is refused from now on, leaves of all nodes included; new
+            bundles for all are in outbox/.
 
         Raises:
             KeysError: no such key, not this fleet's, or the passphrase does not fit.
         """
         path = root_key or self.path / "root" / "root.key"
         try:
-            key = _load(path, passphrase)
+            key = load_signing_key(path, passphrase)
         except FileNotFoundError:
             raise KeysError(
                 f"no root key {path}; bring the medium that holds it, and name the file with --root-key"
@@ -172,7 +157,14 @@ class Authority:
         if key.public_key() != self._root.public_key():
             raise KeysError(f"{path} is not the root key of {self.fleet}")
         with self._changing():
+            old = fingerprint(self._certificate)
             self._key, self._certificate = _certify(self.path, self.fleet, self._root, key)
+            if revoke_old:
+                self._roster.revoked_authorities.append(old)
+                self._roster.deny_serial += 1
+                self._roster.serial += 1
+                for name in list(self._roster.members):
+                    self._bundle(name, LEAF_HOURS)
             self._write_deny_list()
 
     def issue(self, request: bytes, *, hours: float = LEAF_HOURS) -> bytes:
@@ -244,7 +236,11 @@ class Authority:
         """The signed deny list; b"" if nobody was ever revoked."""
         if not self._roster.deny_serial:
             return b""
-        content = {"serial": self._roster.deny_serial, "pseudonyms": sorted(self._roster.revoked)}
+        content = {
+            "serial": self._roster.deny_serial,
+            "pseudonyms": sorted(self._roster.revoked),
+            "authorities": self._roster.revoked_authorities,
+        }
         body = json.dumps(content, sort_keys=True).encode()
         return pack(certificates.der(self._certificate), sign(DENY_LIST, body, self._key))
 
@@ -323,19 +319,6 @@ def _certify(
     key = Ed25519PrivateKey.generate()
     name = f"{fleet} authority"
     certificate = certificates.authority_certificate(name, key.public_key(), root, root_key, time.time(), AUTHORITY_DAYS)
-    _save(path / "ca.key", key, None)
+    save_key(path / "ca.key", key)
     write_atomic(path / "ca.pem", certificates.pem(certificate))
     return key, certificate
-
-
-def _load(path: Path, passphrase: bytes | None) -> Ed25519PrivateKey:
-    key = serialization.load_pem_private_key(path.read_bytes(), passphrase)
-    if not isinstance(key, Ed25519PrivateKey):
-        raise ValueError(f"{path.name} holds a key of another kind")
-    return key
-
-
-def _save(path: Path, key: Ed25519PrivateKey, passphrase: bytes | None) -> None:
-    encryption = serialization.BestAvailableEncryption(passphrase) if passphrase else serialization.NoEncryption()
-    content = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
-    write_atomic(path, content, private=True)

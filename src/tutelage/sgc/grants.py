@@ -1,9 +1,10 @@
 """How a topic's keys travel: a member's request, and the owner's grant. Carriers learn neither node, topic nor key.
 
-    request = curtain(credential, signed(topic's name, nonce))
+    request = curtain(credential, signed(topic's name, nonce, X25519 key to answer to))
     grant   = recipient's key id (16) | curtain(owner's credential, signed(name, recipient, nonce, HPKE(epochs)))
 
-The curtain is a key of all who know the topic's secret; the signatures say who speaks, HPKE who may read.
+The curtain is a key of all who know the topic's secret; the signatures say who speaks, HPKE who may read. The key to answer
+to is made for one run of the member's program: whoever steals its folder later cannot read grants that were recorded.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from __future__ import annotations
 import hashlib
 import hmac
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
 from tutelage.sgc.access import Entry
 from tutelage.sgc.certificates import raw
@@ -39,6 +41,19 @@ def key_id(secret: bytes, purpose: bytes, key: Ed25519PublicKey) -> bytes:
     return hmac.digest(secret, pack(b"tutelage id 1", purpose, raw(key)), hashlib.sha256)[:ID_BYTES]
 
 
+@dataclass(frozen=True)
+class Asker:
+    """A member that asked for a topic's key.
+
+    Attributes:
+        member: who.
+        reply_to: grants are sealed to this.
+    """
+
+    member: Member
+    reply_to: X25519PublicKey
+
+
 class Exchange:
     """Makes and reads requests and grants of one topic. Holds no state."""
 
@@ -47,12 +62,12 @@ class Exchange:
         self._asks = Curtain(entry.secret, ASK)
         self._grants = Curtain(entry.secret, GRANT)
 
-    def ask(self, home: Home, nonce: bytes) -> bytes:
-        """A request by this node."""
-        statement = sign(ASK, pack(self.entry.name, nonce), home.signing_key)
+    def ask(self, home: Home, nonce: bytes, reply_to: X25519PublicKey) -> bytes:
+        """A request by this node, to be answered under the key `reply_to`."""
+        statement = sign(ASK, pack(self.entry.name, nonce, raw(reply_to)), home.signing_key)
         return self._asks.hide(pack(home.credential, statement))
 
-    def read_ask(self, request: bytes, trust: Trust) -> tuple[Member, bytes]:
+    def read_ask(self, request: bytes, trust: Trust) -> tuple[Asker, bytes]:
         """Who asks, and the nonce of the request.
 
         Raises:
@@ -61,11 +76,11 @@ class Exchange:
         _check_size(request)
         credential, statement = unpack(self._asks.lift(request), 2)
         member = trust.verify(credential)
-        name, nonce = unpack(verified(ASK, statement, member.signing), 2)
-        if name != self.entry.name or len(nonce) != NONCE_BYTES:
+        name, nonce, reply_to = unpack(verified(ASK, statement, member.signing), 3)
+        if name != self.entry.name or len(nonce) != NONCE_BYTES or len(reply_to) != 32:
             raise Refused(Reason.MALFORMED, f"a request of {member.node} for the key of another topic")
         self.check_member(member)
-        return member, nonce
+        return Asker(member, X25519PublicKey.from_public_bytes(reply_to)), nonce
 
     def check_member(self, member: Member) -> None:
         """May it hold the topic's key?
@@ -79,22 +94,22 @@ class Exchange:
                 Reason.NOT_ALLOWED, f"{member.node} has no part in {rule.alias}; if it should, add it to the policy"
             )
 
-    def grant(self, home: Home, member: Member, epochs: Sequence[Epoch], nonce: bytes = b"") -> bytes:
+    def grant(self, home: Home, asker: Asker, epochs: Sequence[Epoch], nonce: bytes = b"") -> bytes:
         """The owner's grant to a member.
 
         nonce: of the request that this answers; empty if it answers none.
         """
-        recipient = self.recipient(member.signing)
-        sealed = seal_to(member.sealing, GRANT + self.entry.name, b"".join(epoch.pack() for epoch in epochs))
+        recipient = self.recipient(asker.member.signing)
+        sealed = seal_to(asker.reply_to, GRANT + self.entry.name, b"".join(epoch.pack() for epoch in epochs))
         statement = sign(GRANT, pack(self.entry.name, recipient, nonce, sealed), home.signing_key)
         return self._grants.hide(pack(home.credential, statement), header=recipient)
 
     def read_grant(
-        self, grant: bytes, signing: Ed25519PublicKey, sealing: X25519PrivateKey, trust: Trust, now: float
+        self, grant: bytes, signing: Ed25519PublicKey, reply_to: X25519PrivateKey, trust: Trust, now: float
     ) -> tuple[Member, list[Epoch], bytes]:
         """The owner that granted, the keys in a grant to us, and the nonce that it answers.
 
-        signing, sealing: our keys.
+        signing: our key. reply_to: that of the request.
 
         Raises:
             Refused: NOT_FOR_US, NOT_ALLOWED (not from the owner), FORGED, ...
@@ -113,7 +128,7 @@ class Exchange:
         name, to, nonce, sealed = unpack(verified(GRANT, statement, owner.signing), 4)
         if name != self.entry.name or to != recipient:
             raise Refused(Reason.NOT_FOR_US, f"a grant of {owner.node} for another topic or node")
-        return owner, read_epochs(open_sealed(sealing, GRANT + self.entry.name, sealed), now), nonce
+        return owner, read_epochs(open_sealed(reply_to, GRANT + self.entry.name, sealed), now), nonce
 
     def recipient(self, key: Ed25519PublicKey) -> bytes:
         """Id of a member as the receiver of grants."""

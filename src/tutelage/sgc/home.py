@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Literal
 
 from cryptography import x509
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
@@ -31,6 +30,7 @@ from tutelage.sgc import certificates
 from tutelage.sgc.access import Access
 from tutelage.sgc.bundle import Bundle, is_bundle
 from tutelage.sgc.errors import KeysError, NotIssued
+from tutelage.sgc.privatekeys import load_sealing_key, load_signing_key, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import NODE_NAME, Role
 from tutelage.sgc.trust import Member, Trust
@@ -57,10 +57,7 @@ class Home:
                 raise KeysError(f"{path} has format {content['format']}, this version of Tutelage reads {_FORMAT}")
             self.name, self.role = str(content["name"]), Role(content["role"])
             self.addresses = tuple(str(address) for address in content["addresses"])
-            signing, sealing = _load(self.key_file), _load(path / "sealing.key")
-            if not isinstance(signing, Ed25519PrivateKey) or not isinstance(sealing, X25519PrivateKey):
-                raise ValueError("a key of another kind")
-            self.signing_key, self.sealing_key = signing, sealing
+            self.signing_key, self.sealing_key = load_signing_key(self.key_file), load_sealing_key(path / "sealing.key")
         except FileNotFoundError as error:
             raise KeysError(
                 f"{path} is no node's home (no {Path(error.filename).name}); make one: tutelage keys init {path} --node NAME"
@@ -74,6 +71,7 @@ class Home:
         self._trust: Trust | None = None
         self._bundle: Bundle | None = None
         self._member: Member | None = None
+        self._order: tuple[float, int, float] = (0.0, 0, 0.0)
         self._deny: bytes | None = None
         self.refresh()
 
@@ -103,8 +101,8 @@ class Home:
         os.chmod(path, 0o700)
         if believed is not None:
             write_atomic(path / "root.pem", certificates.pem(believed))
-        _save(path / "signing.key", Ed25519PrivateKey.generate())
-        _save(path / "sealing.key", X25519PrivateKey.generate())
+        save_key(path / "signing.key", Ed25519PrivateKey.generate())
+        save_key(path / "sealing.key", X25519PrivateKey.generate())
         content = {"format": _FORMAT, "name": name, "role": str(role), "addresses": list(addresses)}
         write_atomic(path / "node.json", (json.dumps(content, indent=1) + "\n").encode())
         home = cls(path)
@@ -213,6 +211,8 @@ class Home:
             raise NotIssued(
                 f"{self.name} is revoked; make a new home and have it issued by the authority of {self.access.fleet}"
             )
+        if member.authority in self.trust.deny_list.authorities:
+            raise NotIssued(f"the certificate of {self.name} is by an authority that was revoked; {renew}")
         if now > member.not_after:
             raise NotIssued(f"the certificate of {self.name} expired {_span(now - member.not_after)} ago; {renew}")
         if now < member.not_before:
@@ -244,17 +244,15 @@ class Home:
             bundle, trust, member = Bundle.open(notice, self.sealing_key, self._trust)
             if member.node != self.name or member.role != self.role:
                 raise Refused(Reason.NOT_FOR_US, f"a bundle of the {member.role} {member.node}, and this is {self.name}")
-            if self._bundle is not None and (bundle.access.serial, member.not_before) < (
-                self._bundle.access.serial,
-                self.member.not_before,
-            ):
+            order = trust.since(bundle.authority), bundle.access.serial, member.not_before
+            if self._bundle is not None and order < self._order:
                 held = self._bundle.access.serial
                 raise Refused(
                     Reason.ROLLBACK,
                     f"a bundle with policy {bundle.access.serial}, and {self.name} has {held} or a newer leaf",
                 )
             self._trust = trust
-            if bundle.deny and trust.read_deny_list(bundle.deny).serial > trust.deny_list.serial:
+            if bundle.deny and trust.read_deny_list(bundle.deny).order > trust.deny_list.order:
                 self._accept_deny_list(bundle.deny)
             write_atomic(self.path / "bundle", notice, private=True)
             self.refresh()
@@ -287,6 +285,7 @@ class Home:
             # Not dated: a certificate that expired while the node was off must still be read, to be renewed.
             opened, trust, member = Bundle.open(bundle.read_bytes(), self.sealing_key, trust, dated=False)
             self._bundle, self._member = opened, member
+            self._order = trust.since(opened.authority), opened.access.serial, member.not_before
             leaf = certificates.pem(certificates.load(opened.leaf), certificates.load(opened.authority))
             self._write_if_other(self.leaf_file, leaf)
             self._write_if_other(self.root_file, certificates.pem(trust.root))
@@ -303,19 +302,10 @@ class Home:
 
     def _accept_deny_list(self, notice: bytes) -> None:
         new, old = self.trust.read_deny_list(notice), self.trust.deny_list
-        if new.serial < old.serial:
+        if new.order < old.order:
             raise Refused(Reason.ROLLBACK, f"deny list {new.serial}, older than the {old.serial} of {self.name}")
-        if new.serial > old.serial:
+        if new.order > old.order:
             write_atomic(self.path / "deny", notice)
-
-
-def _load(path: Path) -> object:
-    return serialization.load_pem_private_key(path.read_bytes(), None)
-
-
-def _save(path: Path, key: Ed25519PrivateKey | X25519PrivateKey) -> None:
-    content = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    write_atomic(path, content, private=True)
 
 
 def _read_root(path: Path) -> x509.Certificate:

@@ -37,6 +37,7 @@ class TopicKeys:
         self.path = home.path / "keys" / entry.rule.alias
         self.lock = Lock(self.path.with_suffix(".lock"))
         self.owner: Member | None = None
+        self._owner = ""
         self._sealing = home.sealing_key
         self._made_under: list[int | str] = []
         self._seen = 0
@@ -48,12 +49,22 @@ class TopicKeys:
         sealing = self.epochs.sealing(now)
         return [epoch for epoch in self.epochs.all() if sealing is None or epoch.number >= sealing.number][-4:]
 
-    def learn(self, epochs: list[Epoch]) -> bool:
+    def learn(self, epochs: list[Epoch], owner: Member) -> bool:
         """Keep what a grant brought; True if it was news."""
         new = self.epochs.add(epochs)
-        if new:
+        self.owner, known, self._owner = owner, self._owner, owner.pseudonym
+        if new or known != self._owner:
             self.save()
         return new
+
+    def owner_revoked(self, denied: frozenset[str]) -> bool:
+        """Is the owner that granted the keys one of these pseudonyms?"""
+        return self._owner in denied
+
+    def forget(self) -> None:
+        """Drop all keys."""
+        self.epochs = Epochs()
+        self.save()
 
     def made(self, epoch: Epoch, home: Home) -> None:
         """Keep what this node made as the owner, under the deny list and rule of now."""
@@ -74,6 +85,7 @@ class TopicKeys:
                 for epoch in self.epochs.all()
             ],
             "made_under": self._made_under,
+            "owner": self._owner,
         }
         sealed = seal_to(self._sealing.public_key(), _CONTEXT, json.dumps(content).encode())
         with self.lock:
@@ -94,7 +106,7 @@ class TopicKeys:
             epochs = [
                 Epoch(int(number), bytes.fromhex(key), *map(float, times)) for number, key, *times in content["epochs"]
             ]
-            self._made_under = list(content["made_under"])
+            self._made_under, self._owner = list(content["made_under"]), str(content["owner"])
         except (Refused, OSError, ValueError, TypeError, KeyError):
             return False
         return self.epochs.add(epochs)

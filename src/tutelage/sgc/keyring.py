@@ -13,9 +13,11 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass
 
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+
 from tutelage.sgc.epochs import CLOCK_TOLERANCE, Epoch
 from tutelage.sgc.errors import NoKey, NotAllowed
-from tutelage.sgc.grants import NONCE_BYTES
+from tutelage.sgc.grants import NONCE_BYTES, Asker
 from tutelage.sgc.home import Home
 from tutelage.sgc.keyfile import TopicKeys
 from tutelage.sgc.reasons import Reason, Refusals, Refused
@@ -23,7 +25,7 @@ from tutelage.sgc.rules import Lane
 from tutelage.sgc.trust import Member
 
 _MAX_ASKED = 32
-_MAX_MEMBERS = 16_384
+_MAX_ASKERS = 16_384
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ class Keyring:
         self._topics: dict[str, TopicKeys] = {}
         self._asked: dict[str, OrderedDict[bytes, None]] = {}
         self._answered: dict[str, float] = {}
-        self._members: dict[str, OrderedDict[str, Member]] = {}
+        self._askers: dict[str, OrderedDict[str, Asker]] = {}
+        self._reply_to = X25519PrivateKey.generate()
 
     def owns(self, alias: str) -> bool:
         """Is this node the topic's owner?"""
@@ -91,8 +94,12 @@ class Keyring:
             keys = self._keys(alias, now)
             epoch = keys.epochs.sealing(now)
             if epoch is None:
-                why = "the last one is over" if keys.epochs.newest else "none has arrived yet"
                 owner = keys.entry.rule.owner
+                if keys.owner_revoked(self.home.trust.deny_list.pseudonyms):
+                    raise NoKey(
+                        f"{self.home.name} has no key for {alias}: {owner} is revoked; name another owner in the policy"
+                    )
+                why = "the last one is over" if keys.epochs.newest else "none has arrived yet"
                 raise NoKey(
                     f"{self.home.name} has no valid key for {alias} ({why}); is its owner, {owner}, running and connected?"
                 )
@@ -116,8 +123,10 @@ class Keyring:
         with self._lock:
             return self._keys(alias, now).epochs.opening(number, now)
 
-    def ask(self, alias: str) -> bytes:
+    def ask(self, alias: str, *, by_hand: bool = False) -> bytes:
         """A request for the topic's key, to its owner. Reveals nothing to whoever carries it.
+
+        by_hand: the answer will come by file, perhaps when this program no longer runs: `accept` it by hand too.
 
         Raises:
             NotAllowed: this node has no part in the topic.
@@ -129,7 +138,8 @@ class Keyring:
             asked[nonce] = None
             while len(asked) > _MAX_ASKED:
                 asked.popitem(last=False)
-        return keys.exchange.ask(self.home, nonce)
+        reply_to = self.home.sealing_key if by_hand else self._reply_to
+        return keys.exchange.ask(self.home, nonce, reply_to.public_key())
 
     def answer(self, alias: str, request: bytes) -> bytes:
         """The owner's answer: the present key (and the next, if it is about to begin), for the node that asked.
@@ -139,17 +149,17 @@ class Keyring:
             NotAllowed: this node is not the owner.
         """
         self._check_owner(alias)
-        with self._counted():
+        with self.refusals.counting():
             keys = self._keys(alias, time.time())
-            member, nonce = keys.exchange.read_ask(bytes(request), self.home.trust)
+            asker, nonce = keys.exchange.read_ask(bytes(request), self.home.trust)
             with self._lock:
                 epochs = keys.current(time.time())
-                members = self._members.setdefault(alias, OrderedDict())
-                members[member.pseudonym] = member
-                members.move_to_end(member.pseudonym)
-                while len(members) > _MAX_MEMBERS:
-                    members.popitem(last=False)
-            return keys.exchange.grant(self.home, member, epochs, nonce)
+                askers = self._askers.setdefault(alias, OrderedDict())
+                askers[asker.member.pseudonym] = asker
+                askers.move_to_end(asker.member.pseudonym)
+                while len(askers) > _MAX_ASKERS:
+                    askers.popitem(last=False)
+            return keys.exchange.grant(self.home, asker, epochs, nonce)
 
     def accept(self, alias: str, grant: bytes, *, by_hand: bool = False) -> int:
         """Take a grant, in answer to `ask` or pushed. Returns the number of the newest epoch.
@@ -163,12 +173,12 @@ class Keyring:
         """
         now = time.time()
         keys = self._keys(alias, now)
-        with self._counted():
-            signing, sealing = self.home.signing_key.public_key(), self.home.sealing_key
-            owner, epochs, nonce = keys.exchange.read_grant(bytes(grant), signing, sealing, self.home.trust, now)
+        with self.refusals.counting():
+            signing, reply_to = self.home.signing_key.public_key(), self.home.sealing_key if by_hand else self._reply_to
+            owner, epochs, nonce = keys.exchange.read_grant(bytes(grant), signing, reply_to, self.home.trust, now)
             with self._lock:
                 newest = keys.epochs.newest
-                if nonce:
+                if nonce and not by_hand:
                     if nonce not in self._asked.get(alias, ()):
                         raise Refused(Reason.REPLAYED, f"a grant of {alias} that answers no request of {self.home.name}")
                     del self._asked[alias][nonce]
@@ -177,10 +187,9 @@ class Keyring:
                 number = max(epoch.number for epoch in epochs)
                 if newest is not None and number < newest.number:
                     raise Refused(Reason.ROLLBACK, f"a grant of {alias} with epoch {number}, and {newest.number} is known")
-                keys.owner = owner
                 if nonce:
                     self._answered[alias] = now
-                if keys.learn(epochs):
+                if keys.learn(epochs, owner):
                     self.version += 1
                 return number
 
@@ -227,8 +236,8 @@ class Keyring:
         return [push for alias in changed for push in self._pushes(alias, now)]
 
     def wanted(self, now: float | None = None) -> list[str]:
-        """Aliases of topics whose key this node should `ask` for: it has none, the one it has ends soon, or it sends there
-        and has not heard from the owner for a while."""
+        """Aliases of topics whose key this node should `ask` for: it has none, the one it has ends soon, it has not asked
+        since it started, or it sends there and has not heard from the owner for a while."""
         now = time.time() if now is None else now
         with self._lock:
             return [alias for alias in self.home.access.topics if not self.owns(alias) and self._wants(alias, now)]
@@ -239,12 +248,12 @@ class Keyring:
         with self._lock:
             keys = self._topics.get(alias)
             owner = [keys.owner] if keys is not None and keys.owner is not None else []
-            return [*owner, *self._members.get(alias, OrderedDict()).values()]
+            return [*owner, *(asker.member for asker in self._askers.get(alias, OrderedDict()).values())]
 
     def _wants(self, alias: str, now: float) -> bool:
         keys = self._keys(alias, now)
         rule, epoch = keys.entry.rule, keys.epochs.sealing(now)
-        if epoch is None or epoch.ends - now < rule.rotate_every / 2:
+        if epoch is None or epoch.ends - now < rule.rotate_every / 2 or alias not in self._answered:
             return True
         sends = any(rule.may_send(self.home.name, lane) for lane in rule.lanes() if lane != Lane.PRESENCE)
         return sends and now - self._answered.get(alias, 0.0) > self._grace
@@ -256,8 +265,11 @@ class Keyring:
             keys = self._topics.get(alias)
             if keys is None or keys.entry is not entry:
                 before, keys = keys, TopicKeys(self.home, entry)
-                keys.owner = before.owner if before is not None else None
+                keys.owner = before.owner if before is not None else keys.owner
                 self._topics[alias] = keys
+                self.version += 1
+            if keys.epochs.newest and keys.owner_revoked(self.home.trust.deny_list.pseudonyms):
+                keys.forget()  # whoever revoked the owner does not want it to read on
                 self.version += 1
             if self.owns(alias) and keys.epochs.sealing(now) is None:
                 self._rotate(alias, now, begins=now - CLOCK_TOLERANCE, grace=self._grace)
@@ -277,36 +289,19 @@ class Keyring:
     def _pushes(self, alias: str, now: float) -> list[Push]:
         allowed = []
         with self._lock:
-            keys, members = self._topics[alias], self._members.get(alias, OrderedDict())
+            keys, askers = self._topics[alias], self._askers.get(alias, OrderedDict())
             epochs = keys.current(now)
-            for pseudonym, member in list(members.items()):
+            for pseudonym, asker in list(askers.items()):
                 try:
-                    self.home.trust.check(member, now)
-                    keys.exchange.check_member(member)
-                    allowed.append(member)
+                    self.home.trust.check(asker.member, now)
+                    keys.exchange.check_member(asker.member)
+                    allowed.append(asker)
                 except Refused:
-                    del members[pseudonym]  # it must ask again, and show that it may
+                    del askers[pseudonym]  # it must ask again, and show that it may
         # Without the lock, as thousands of members take a second, and messages must go on meanwhile.
-        return [Push(alias, keys.exchange.grant(self.home, member, epochs), member.node) for member in allowed]
+        return [Push(alias, keys.exchange.grant(self.home, asker, epochs), asker.member.node) for asker in allowed]
 
     def _check_owner(self, alias: str) -> None:
         entry = self.home.access.entry(alias)
         if not self.owns(alias):
             raise NotAllowed(f"{self.home.name} does not own {alias}; its owner in the policy is {entry.rule.owner}")
-
-    def _counted(self) -> _Counted:
-        return _Counted(self.refusals)
-
-
-class _Counted:
-    """Counts the refusals that leave a block."""
-
-    def __init__(self, refusals: Refusals) -> None:
-        self._refusals = refusals
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if isinstance(error, Refused):
-            self._refusals.add(error.reason)

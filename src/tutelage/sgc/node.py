@@ -146,19 +146,25 @@ class Node:
             return publisher
 
     def subscribe(
-        self, alias: str, on_message: Callable[[Message], None] | None = None, *, queue: int | None = None
+        self,
+        alias: str,
+        on_message: Callable[[Message], None] | None = None,
+        *,
+        queue: int | None = None,
+        provisional: bool = False,
     ) -> Subscription:
         """Receive a topic's messages.
 
         on_message: called on a thread of the subscription's own; may take its time. An exception is logged and counted.
         queue: messages that may wait for the application; default: 64 on a reliable topic, 1 on a lossy one. Beyond: on a
             reliable topic, the rest is fetched again from the publisher when there is room; on a lossy one the newest win.
+        provisional: chain mode: deliver at once, with `Message.authentic` False, what the chain confirms 20 ms later.
 
         Raises:
             NotAllowed: the policy does not let this node subscribe there.
         """
         entry = self._entry(alias, Kind.STREAM)
-        opener = Opener(self.keyring, alias)
+        opener = Opener(self.keyring, alias, provisional=provisional)
         subscription = Subscription(alias, entry, opener, self.transport, self._need_key, self._pool, on_message, queue)
         with self._lock:
             self._subscriptions = [each for each in self._subscriptions if not each.closed] + [subscription]

@@ -31,6 +31,24 @@ from tutelage.sgc.access import Entry, Route
 from tutelage.sgc.rules import NODE_NAME, Kind, Lane, TopicRule
 
 VERSION = 1
+TEMPLATE = """version = 1
+
+# Who may say and hear what. Without a table here nobody may do anything. After a change: tutelage keys issue FOLDER --policy
+#
+# renewals = "office"               # the node that renews certificates over the network: tutelage keys serve
+#
+# [topics.camera]
+# node = "drone-1"                  # metadata: its 256-bit name is made from it
+# interface = "/camera"
+# type = "sensor_msgs/msg/Image"
+# owner = "drone-1"                 # the node that hands out the topic's keys
+# publish = ["drone-1"]
+# subscribe = ["server", "operator-*"]
+# authenticity = "signature"        # or "session", "chain"
+# delivery = "lossy"                # or "reliable"
+# max_age = 0.5                     # seconds; commands should have one
+"""
+"""The file of a new fleet."""
 
 
 @dataclass(frozen=True)

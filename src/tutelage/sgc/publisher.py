@@ -74,7 +74,9 @@ class Publisher:
         self._busy = False
         self._closing = False
         self._failure: TutelageError | None = None
+        self._flushing = 0
         self._free_at = self._greeted = 0.0
+        self._wakes_at = float("-inf")
         session = entry.rule.authenticity == Authenticity.SESSION
         self._life_at = self._born if session else float("inf")  # receivers without a session learn that we are there
         self._pause = FIRST_LIFE
@@ -119,7 +121,11 @@ class Publisher:
     def flush(self, timeout: float) -> bool:
         """Wait until everything queued has been handed to the transport; False: it was not within `timeout` seconds."""
         with self._changed:
-            return self._changed.wait_for(lambda: not self._queue and not self._busy, timeout)
+            self._flushing += 1
+            try:
+                return self._changed.wait_for(lambda: not self._queue and not self._busy, timeout)
+            finally:
+                self._flushing -= 1
 
     def close(self) -> None:
         """Send what is queued (at most a second), then stop."""
@@ -211,7 +217,7 @@ class Publisher:
                 head = frames.head(frames.Kind.WHOLE, age)
                 self._publish([head + payload for payload, _ in batch], batch[0][1])
             self.sent += len(batch)
-            self.bytes += sum(len(payload) for payload, _ in batch)
+            self.bytes += len(batch[0][0]) if len(batch) == 1 else sum(len(payload) for payload, _ in batch)
         except NoKey:
             with self._changed:
                 self._queue.extendleft(reversed(batch))
@@ -232,7 +238,9 @@ class Publisher:
             self._life_at = now + FIRST_LIFE if not self._lossy else float("inf")
             if self._chain:
                 self._anchor_at = min(self._anchor_at, now + self._anchor_every)
-            self._changed.notify_all()
+            # The worker is woken only if it must do something sooner than it thinks: a wake costs more than a small message.
+            if self._queue or self._flushing or min(self._life_at, self._anchor_at) < self._wakes_at:
+                self._changed.notify_all()
 
     def _publish(self, payloads: list[bytes], sent: int) -> None:
         with self._sealing:
@@ -245,7 +253,8 @@ class Publisher:
 
     def _hand_over(self, first: int, packet: bytes | bytearray) -> None:
         if not self._lossy:
-            self._history.add(first, self._sealer.sequence, packet, time.monotonic())
+            last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
+            self._history.add(min(first, last), last, packet, time.monotonic())
         self.packets += 1
         self._transport.publish(self._key, packet, reliable=not self._lossy)
 
@@ -285,7 +294,11 @@ class Publisher:
                 self._busy = True
                 return self._show_life
             until = min(self._anchor_at, self._life_at, self._free_at if self._queue else float("inf"))
-            self._changed.wait(None if self._busy or until == float("inf") else max(0.0, until - now))
+            if self._busy:  # whoever is busy looks after us
+                until = float("inf")
+            self._wakes_at = until
+            self._changed.wait(None if until == float("inf") else max(0.0, until - now))
+            self._wakes_at = float("-inf")
 
     def _show_life(self) -> None:
         try:

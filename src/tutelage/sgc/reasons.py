@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 
 from tutelage.errors import TutelageError
@@ -57,6 +59,15 @@ class Refusals:
         """Count."""
         with self._lock:
             self._counts[reason] += count
+
+    @contextmanager
+    def counting(self) -> Iterator[None]:
+        """Count the refusal that leaves the block, if one does."""
+        try:
+            yield
+        except Refused as refused:
+            self.add(refused.reason)
+            raise
 
     def __getitem__(self, reason: Reason) -> int:
         return self._counts[reason]

@@ -52,6 +52,8 @@ class Roster:
         self.members: dict[str, Record] = {}
         self.revoked: dict[str, tuple[str, str]] = {}
         """By pseudonym: name and signing key (hexadecimal), so that these keys are not let in again."""
+        self.revoked_authorities: list[str] = []
+        """Fingerprints of the authority's own certificates whose keys were stolen."""
 
     def admit(self, keys: Keys) -> None:
         """The node `keys.common_name`: a new member gets a random pseudonym, a known one may get other addresses."""
@@ -89,6 +91,7 @@ class Roster:
             "members_serial": self.members_serial,
             "members": {name: _to_json(record) for name, record in self.members.items()},
             "revoked": self.revoked,
+            "revoked_authorities": self.revoked_authorities,
         }
         write_atomic(self.path, (json.dumps(content, indent=1) + "\n").encode(), private=True)
 
@@ -108,6 +111,7 @@ class Roster:
             roster.members_serial = int(content["members_serial"])
             roster.members = {name: _from_json(name, one) for name, one in content["members"].items()}
             roster.revoked = {str(pseudonym): (str(name), str(key)) for pseudonym, (name, key) in content["revoked"].items()}
+            roster.revoked_authorities = [str(one) for one in content["revoked_authorities"]]
         except (KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{path.name}: {error!r}") from None
         return roster

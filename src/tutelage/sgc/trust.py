@@ -36,6 +36,7 @@ class Member:
         signing: its signatures verify under this.
         sealing: what only it may read is sealed to this.
         not_before, not_after: validity, seconds since 1970.
+        authority: fingerprint of the authority that issued its certificate.
     """
 
     node: str
@@ -45,19 +46,30 @@ class Member:
     sealing: X25519PublicKey
     not_before: float
     not_after: float
+    authority: str
 
 
 @dataclass(frozen=True)
 class DenyList:
-    """Pseudonyms that are revoked, signed by the fleet's authority.
+    """Who is revoked, signed by the fleet's authority.
 
     Attributes:
         serial: counts up with every change.
-        pseudonyms: who.
+        pseudonyms: of nodes and routers.
+        authorities: fingerprints of certificates of the authority whose key was stolen.
+        since: when the certificate of the authority that signed it begins, seconds since 1970. What a newer authority says
+            counts more than any serial of an older one, so that a thief of the older one's key cannot have the last word.
     """
 
     serial: int = 0
     pseudonyms: frozenset[str] = frozenset()
+    authorities: frozenset[str] = frozenset()
+    since: float = 0.0
+
+    @property
+    def order(self) -> tuple[float, int]:
+        """The greater one counts."""
+        return self.since, self.serial
 
 
 class Trust:
@@ -112,8 +124,13 @@ class Trust:
             Refused: EXPIRED or REVOKED.
         """
         now = time.time() if now is None else now
-        if member.pseudonym in self.deny_list.pseudonyms:
+        deny = self.deny_list
+        if member.pseudonym in deny.pseudonyms:
             raise Refused(Reason.REVOKED, f"{member.node} is revoked")
+        if member.authority in deny.authorities:
+            raise Refused(
+                Reason.REVOKED, f"the certificate of {member.node} is by an authority that was revoked; renew it there"
+            )
         if now > member.not_after:
             raise Refused(
                 Reason.EXPIRED,
@@ -131,9 +148,11 @@ class Trust:
         dated: False to believe it whatever the time, for what was accepted in its time.
 
         Raises:
-            Refused: MALFORMED, WRONG_AUTHORITY or EXPIRED.
+            Refused: MALFORMED, WRONG_AUTHORITY, EXPIRED or REVOKED.
         """
         found = self._authority(certificate)
+        if dated and fingerprint(found) in self.deny_list.authorities:
+            raise Refused(Reason.REVOKED, "signed by an authority that was revoked")
         now = time.time() if now is None else now
         if dated and not found.not_valid_before_utc.timestamp() <= now <= found.not_valid_after_utc.timestamp():
             raise Refused(
@@ -143,6 +162,14 @@ class Trust:
         key = found.public_key()
         assert isinstance(key, Ed25519PublicKey)  # _authority saw to it
         return key
+
+    def since(self, certificate: bytes) -> float:
+        """When the certificate of an authority (DER) begins, seconds since 1970.
+
+        Raises:
+            Refused: MALFORMED or WRONG_AUTHORITY.
+        """
+        return self._authority(certificate).not_valid_before_utc.timestamp()
 
     def read_deny_list(self, notice: bytes, now: float | None = None, *, dated: bool = True) -> DenyList:
         """Read a signed deny list; whether it is newer is for the caller to compare. For `dated` see `authority`.
@@ -154,10 +181,10 @@ class Trust:
         body = verified(DENY_LIST, statement, self.authority(certificate, now, dated=dated), Reason.WRONG_AUTHORITY)
         try:
             content = json.loads(body)
-            pseudonyms = frozenset(content["pseudonyms"])
+            pseudonyms, authorities = frozenset(content["pseudonyms"]), frozenset(content["authorities"])
             if not all(isinstance(one, str) and PSEUDONYM.fullmatch(one) for one in pseudonyms):
                 raise ValueError("a pseudonym is not one")
-            return DenyList(int(content["serial"]), pseudonyms)
+            return DenyList(int(content["serial"]), pseudonyms, authorities, self.since(certificate))
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise Refused(Reason.MALFORMED, f"not a deny list: {error}") from None
 
@@ -195,7 +222,7 @@ class Trust:
             raise Refused(Reason.WRONG_AUTHORITY, f"the membership of {node} is for another certificate")
         begin = max(leaf.not_valid_before_utc, authority.not_valid_before_utc).timestamp()
         end = min(leaf.not_valid_after_utc, authority.not_valid_after_utc).timestamp()
-        return Member(node, pseudonym, keys.role, keys.signing, keys.sealing, begin, end)
+        return Member(node, pseudonym, keys.role, keys.signing, keys.sealing, begin, end, fingerprint(authority))
 
 
 def membership(node: str, pseudonym: str, signing: bytes, sealing: bytes) -> bytes:

@@ -107,6 +107,7 @@ def renew(
     hours: float = 24.0,
     root_key: Path | None = None,
     passphrase_file: Path | None = None,
+    revoke_old: bool = False,
 ) -> None:
     """A new certificate for a node, while it runs: by a file, from an authority on this machine, or over the network.
 
@@ -117,12 +118,15 @@ def renew(
         hours: validity, with --authority.
         root_key: for an authority: where the root's key is, if not in its folder.
         passphrase_file: for an authority: the passphrase of the root's key.
+        revoke_old: for an authority whose key was stolen: refuse all that it signed; all nodes need their new bundles.
     """
     _need()
     if (home / "state.json").exists():
         fleet = _authority(home)
-        fleet.renew_own(root_key, _passphrase(passphrase_file))
+        fleet.renew_own(root_key, _passphrase(passphrase_file), revoke_old=revoke_old)
         _say(f"the authority of {fleet.fleet} has a new key, valid until {_when(fleet.certificate.not_valid_after_utc)}")
+        if revoke_old:
+            _say(f"what the old key signed is refused; carry the bundles in {home / 'outbox'} to all nodes and routers")
         return
     from tutelage.sgc.reasons import Reason, Refused
 
@@ -285,6 +289,8 @@ def _show_authority(fleet: Authority) -> None:
     for name, record in sorted(roster.members.items()):
         expired = ", EXPIRED" if record.expires < time.time() else ""
         _say(f"{record.keys.role} {name}: {record.pseudonym} until {_when(record.expires)}{expired}")
+    for old in roster.revoked_authorities:
+        _say(f"revoked authority {old}")
     for pseudonym, (name, _) in sorted(roster.revoked.items(), key=lambda one: one[1]):
         _say(f"revoked {name}: {pseudonym}")
 
