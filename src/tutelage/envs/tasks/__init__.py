@@ -13,4 +13,15 @@ TASKS: dict[str, type[MujocoTask]] = {
     task.name: task for task in (HalfCheetah, Walker2d, Ant, Humanoid, Anymal, PegInsertion, CableRouting)
 }
 
-__all__ = ["TASKS", "Ant", "Anymal", "CableRouting", "GoalTask", "HalfCheetah", "Humanoid", "MujocoTask", "PegInsertion", "Walker2d"]
+__all__ = [
+    "TASKS",
+    "Ant",
+    "Anymal",
+    "CableRouting",
+    "GoalTask",
+    "HalfCheetah",
+    "Humanoid",
+    "MujocoTask",
+    "PegInsertion",
+    "Walker2d",
+]

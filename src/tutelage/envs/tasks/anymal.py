@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.envs.tasks.base import Array, Frame, MujocoTask
+from tutelage.fleet.reflection import Reflection
 
 STANDING = np.array([0.0, 0.4, -0.8, 0.0, -0.4, 0.8] * 2)
 """Joint angles, rad, about which actions move the targets: abduction, thigh and shank of left front, left hind, right front
@@ -30,6 +31,19 @@ SCALE = np.concatenate(
 _QUATERNION, _JOINTS, _DIALS = slice(3, 7), slice(7, 19), slice(19, 22)
 _LINEAR, _ANGULAR, _JOINT_VELOCITIES, _DIAL_SPEEDS = slice(0, 3), slice(3, 6), slice(6, 18), slice(18, 21)
 
+# A robot whose left and right, or front and hind, legs change places. Vectors change the sign along the axis of the mirror;
+# rotations (angular velocity, turn, joint angles) about the two others.
+_LEFT_RIGHT = [6, 7, 8, 9, 10, 11, 0, 1, 2, 3, 4, 5], np.array([-1.0, 1.0, 1.0] * 4)
+_FRONT_HIND = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8], np.array([1.0, -1.0, -1.0] * 4)
+_ACROSS_Y = np.array([1.0, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, -1])
+_ACROSS_X = np.array([-1.0, 1, 1, 1, -1, -1, -1, 1, 1, -1, 1, -1])
+
+
+def _reflection(legs: list[int], sign: Array, body_sign: Array) -> Reflection:
+    order = np.array(legs)
+    joints = [12 + order, 24 + order, 36 + order]
+    return Reflection(np.concatenate([np.arange(12), *joints]), np.concatenate([body_sign, sign, sign, sign]), order, sign)
+
 
 class Anymal(MujocoTask):
     """48 observations, 12 actions.
@@ -42,10 +56,15 @@ class Anymal(MujocoTask):
     Violation: the base or a knee presses on the ground with more than `CONTACT`.
     """
 
-    name, xml, frame_skip = "Anymal", "anymal.xml", 4
+    name, xml, frame_skip = "Anymal", "anymal.xml", 2
     assets = Path(__file__).parent / "assets"
     fields = ("qpos", "qvel", "qacc", "ctrl", "actuator_force", "sensordata")
     horizon = 2500
+    reflections = (
+        _reflection(*_LEFT_RIGHT, _ACROSS_Y),
+        _reflection(*_FRONT_HIND, _ACROSS_X),
+        _reflection([_LEFT_RIGHT[0][k] for k in _FRONT_HIND[0]], _LEFT_RIGHT[1] * _FRONT_HIND[1], _ACROSS_X * _ACROSS_Y),
+    )
     summary = "a quadruped follows velocity commands; violation: base or knee touches the ground"
 
     def observe(self, frame: Frame) -> Array:
@@ -74,11 +93,11 @@ class Anymal(MujocoTask):
         along = np.exp(-4.0 * np.square(command[:, :2] - linear[:, :2]).sum(axis=1))
         turn = np.exp(-4.0 * np.square(command[:, 2] - v[:, 5]))
         cost = (
-            1.0 * np.square(linear[:, 2])
-            + 0.05 * np.square(v[:, 3:5]).sum(axis=1)
-            + 1.0 * np.square(rotation[:, 2, :2]).sum(axis=1)
-            + 2.5e-5 * np.square(frame["actuator_force"]).sum(axis=1)
-            + 1e-7 * np.square(frame["qacc"][:, _JOINT_VELOCITIES]).sum(axis=1)
+            np.square(linear[:, 2])
+            + 0.02 * np.square(v[:, 3:5]).sum(axis=1)
+            + 0.5 * np.square(rotation[:, 2, :2]).sum(axis=1)
+            + 1e-5 * np.square(frame["actuator_force"]).sum(axis=1)
+            + 2.5e-8 * np.square(frame["qacc"][:, _JOINT_VELOCITIES]).sum(axis=1)
         )
         return 0.02 * (along + 0.5 * turn - np.minimum(cost, 1.0))  # type: ignore[no-any-return]
 
@@ -95,8 +114,11 @@ class Anymal(MujocoTask):
 
 
 def commands(frame: Frame) -> Array:
-    """Forward and sideways velocity, m/s, and turn, rad/s, that each robot is to follow, (N, 3): sines of the dials."""
-    return COMMAND * np.sin(frame["qpos"][:, _DIALS])  # type: ignore[no-any-return]
+    """Forward and sideways velocity, m/s, and turn, rad/s, that each robot is to follow, (N, 3).
+
+    Triangle waves of the dials: all commands are equally frequent.
+    """
+    return COMMAND * (2 / np.pi * np.arcsin(np.sin(frame["qpos"][:, _DIALS])))  # type: ignore[no-any-return]
 
 
 def rotations(quaternion: Array) -> Array:
