@@ -29,8 +29,7 @@ def train(config: ExpertConfig, say: Callable[[str], None] = print) -> Path:
         fleet.close()
         raise ConfigError(f"the expert of {config.task} is a program, {fleet.task.expert}: nothing to train")
     level = config.disturbance or fleet.task.disturbance
-    features = fleet.task.expert_features or fleet.single_observation_space.shape[0]  # type: ignore[index]
-    ppo = PPO(fleet, features, config.ppo, config.seed, fleet.task.reflections)
+    ppo = PPO(fleet, fleet.task.expert_features or fleet.single_observation_space.shape[0], config.ppo, config.seed)  # type: ignore[index]
     checkpoint, best_path, best = out / "ppo.safetensors", out / "best.safetensors", float("-inf")
     if checkpoint.exists():
         ppo.load(checkpoint)

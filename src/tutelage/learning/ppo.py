@@ -6,8 +6,6 @@ bootstrapped (they are not failures), and the learning rate follows the KL diver
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +17,6 @@ from torch import Tensor
 
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet
-from tutelage.fleet.reflection import Reflection
-from tutelage.learning.mirrors import Mirrors
 from tutelage.learning.optimiser import load_optimiser_state, optimiser_state
 from tutelage.policies.expert import GaussianActor, tanh_mlp
 from tutelage.policies.weights import load_module_state, module_state
@@ -48,7 +44,6 @@ class PPOConfig:
         entropy: weight of the entropy bonus.
         fall_penalty: subtracted from the reward of a step that ends in violation, for a safer gait; scores never
             include it.
-        initial_std: standard deviation of the exploration at first, in half ranges of an action; default: the actor's own.
         hidden: widths of the hidden layers of actor and critic.
     """
 
@@ -63,7 +58,6 @@ class PPOConfig:
     max_grad_norm: float = 1.0
     entropy: float = 0.0
     fall_penalty: float = 0.0
-    initial_std: float | None = None
     hidden: tuple[int, ...] = (256, 128)
 
     def __post_init__(self) -> None:
@@ -71,8 +65,6 @@ class PPOConfig:
             raise ConfigError("PPO needs rollout, epochs, minibatch and hidden widths of at least 1")
         if not (0 <= self.gamma <= 1 and 0 <= self.lam <= 1 and self.learning_rate > 0 and self.target_kl > 0):
             raise ConfigError("PPO needs gamma and lam in [0, 1], learning_rate > 0 and target_kl > 0")
-        if self.initial_std is not None and not 0 < self.initial_std < math.inf:
-            raise ConfigError(f"initial_std must be a number above 0, got {self.initial_std}")
 
 
 class RunningMoments:
@@ -101,25 +93,18 @@ class PPO:
         fleet: any fleet; violations end an episode, the horizon truncates it.
         features: how many leading numbers of an observation actor and critic see.
         seed: root seed.
-        reflections: mirror images of a robot for which the task is the same: every update sees each transition as that of
-            one of them, drawn at random, so that what one leg learns all do.
     """
 
-    def __init__(
-        self, fleet: Fleet, features: int, config: PPOConfig, seed: int, reflections: Sequence[Reflection] = ()
-    ) -> None:
+    def __init__(self, fleet: Fleet, features: int, config: PPOConfig, seed: int) -> None:
         self.fleet, self.config, self.features = fleet, config, features
         torch.manual_seed(derive(seed, "ppo/initial weights"))
         self.actor = GaussianActor(features, fleet.action_low, fleet.action_high, config.hidden)
-        if config.initial_std is not None:
-            torch.nn.init.constant_(self.actor.log_std, math.log(config.initial_std))
         self.critic = tanh_mlp(features, 1, config.hidden, last_gain=1.0)
         self.parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.learning_rate = config.learning_rate
         self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate, eps=1e-5)
         self.rng = stream(seed, "ppo/noise")
         self.obs_moments, self.return_moments = RunningMoments(features), RunningMoments(1)
-        self.mirrors = Mirrors(reflections, features, fleet.action_low.size) if reflections else None
         self.steps = 0
         self._discounted = np.zeros(fleet.num_envs)
         self._obs, _ = fleet.reset(seed=derive(seed, "ppo/fleet") % 2**32)
@@ -165,21 +150,16 @@ class PPO:
             nexts.append(torch.where(torch.from_numpy(terminated), 0.0, self.critic(after)[:, 0]))
             ends.append(torch.from_numpy(done).float())
         self.steps += n * c.rollout
-        seen = np.concatenate(raw)
-        self.obs_moments.update(self.mirrors.all_of(seen) if self.mirrors else seen)
+        self.obs_moments.update(np.concatenate(raw))
 
         advantage, running = [torch.zeros(n)] * c.rollout, torch.zeros(n)
         for t in reversed(range(c.rollout)):
             delta = rewards[t] + c.gamma * nexts[t] - values[t]
             running = delta + c.gamma * c.lam * (1 - ends[t]) * running
             advantage[t] = running
-        a, x, u, log_prob = torch.cat(advantage), torch.cat(xs), torch.cat(us), torch.cat(log_probs)
-        if self.mirrors:
-            # The ratio of an update starts at 1 for a mirror image too, so that it measures the update alone.
-            x, u = self.mirrors.draw(self.rng, x, u)
-            log_prob = self.actor.log_prob(self.actor.net(x), u)
+        a = torch.cat(advantage)
         return {
-            "x": x, "u": u, "log_prob": log_prob,
+            "x": torch.cat(xs), "u": torch.cat(us), "log_prob": torch.cat(log_probs),
             "target": a + torch.cat(values), "advantage": (a - a.mean()) / (a.std() + 1e-8),
         }  # fmt: skip
 

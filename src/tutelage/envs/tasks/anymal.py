@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.envs.tasks.base import Array, Frame, MujocoTask
-from tutelage.fleet.reflection import Reflection
 
 STANDING = np.array([0.0, 0.4, -0.8, 0.0, -0.4, 0.8] * 2)
 """Joint angles, rad, about which actions move the targets: abduction, thigh and shank of left front, left hind, right front
 and right hind leg."""
+ACTION, STIFFNESS = 0.5, 150.0
+"""How far an action of 1 moves a target, rad, and the torque per rad from it, N m: those of the model file."""
 COMMAND = np.array([1.0, 0.5, 1.0])
 """Largest command: forward and to the left, m/s, and turn to the left, rad/s."""
 PERIOD = 10.0, 25.0
@@ -31,19 +32,6 @@ SCALE = np.concatenate(
 _QUATERNION, _JOINTS, _DIALS = slice(3, 7), slice(7, 19), slice(19, 22)
 _LINEAR, _ANGULAR, _JOINT_VELOCITIES, _DIAL_SPEEDS = slice(0, 3), slice(3, 6), slice(6, 18), slice(18, 21)
 
-# A robot whose left and right, or front and hind, legs change places. Vectors change the sign along the axis of the mirror;
-# rotations (angular velocity, turn, joint angles) about the two others.
-_LEFT_RIGHT = [6, 7, 8, 9, 10, 11, 0, 1, 2, 3, 4, 5], np.array([-1.0, 1.0, 1.0] * 4)
-_FRONT_HIND = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8], np.array([1.0, -1.0, -1.0] * 4)
-_ACROSS_Y = np.array([1.0, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, -1])
-_ACROSS_X = np.array([-1.0, 1, 1, 1, -1, -1, -1, 1, 1, -1, 1, -1])
-
-
-def _reflection(legs: list[int], sign: Array, body_sign: Array) -> Reflection:
-    order = np.array(legs)
-    joints = [12 + order, 24 + order, 36 + order]
-    return Reflection(np.concatenate([np.arange(12), *joints]), np.concatenate([body_sign, sign, sign, sign]), order, sign)
-
 
 class Anymal(MujocoTask):
     """48 observations, 12 actions.
@@ -52,7 +40,7 @@ class Anymal(MujocoTask):
     (3), all as the base sees them; the commands (3: forward and to the left, m/s, turn, rad/s); joint angles from `STANDING`
     (12, rad) and velocities (12, rad/s); the previous actions (12).
 
-    Actions in [-1, 1] move the position targets of the joints by up to 0.5 rad from `STANDING`, 50 times a second.
+    Actions in [-1, 1] move the position targets of the joints by up to `ACTION` from `STANDING`, 50 times a second.
     Violation: the base or a knee presses on the ground with more than `CONTACT`.
     """
 
@@ -60,11 +48,8 @@ class Anymal(MujocoTask):
     assets = Path(__file__).parent / "assets"
     fields = ("qpos", "qvel", "qacc", "ctrl", "actuator_force", "sensordata")
     horizon = 2500
-    reflections = (
-        _reflection(*_LEFT_RIGHT, _ACROSS_Y),
-        _reflection(*_FRONT_HIND, _ACROSS_X),
-        _reflection([_LEFT_RIGHT[0][k] for k in _FRONT_HIND[0]], _LEFT_RIGHT[1] * _FRONT_HIND[1], _ACROSS_X * _ACROSS_Y),
-    )
+    disturbance = "moderate"
+    expert = "tutelage.envs.experts.anymal:Trotter"
     summary = "a quadruped follows velocity commands; violation: base or knee touches the ground"
 
     def observe(self, frame: Frame) -> Array:

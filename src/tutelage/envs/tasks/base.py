@@ -10,8 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.fleet.reflection import Reflection
-
 Array = NDArray[Any]
 Frame = dict[str, Array]
 
@@ -48,8 +46,7 @@ class MujocoTask(ABC):
     """The algorithmic human, where it is a program: "module:callable" of a policy. None: trained weights."""
     expert_features: ClassVar[int | None] = None
     """The expert sees only the first so many numbers of an observation; None: all."""
-    reflections: ClassVar[tuple[Reflection, ...]] = ()
-    """The mirror images of a robot for which the task is the same, other than itself."""
+    symmetry: ClassVar[tuple[Array, Array] | None] = None
     action_low: ClassVar[Array | None] = None
     action_high: ClassVar[Array | None] = None
     """(A,) bounds of the actions; None: those of the actuators. Set them together with `control`."""
