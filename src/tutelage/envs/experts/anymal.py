@@ -9,13 +9,13 @@ from tutelage.envs.tasks.base import Array
 
 CYCLE = 14
 """Timesteps of 0.02 s in which each foot is once on the ground and once in the air, half of the time each."""
-HEIGHT, CLEARANCE, WIDTH = 0.5, 0.065, 0.205
+HEIGHT, CLEARANCE, WIDTH = 0.5, 0.065, 0.23
 """Of the hips above the middle of the feet, of a foot in the air, and from a hip's axis out to its foot, m."""
 GAIN = np.array([2.0, 1.2, 2.0])
 """How much further (forward, sideways, turning) the feet sweep than on rigid legs: theirs give way."""
 FEEDBACK, SHIFT = 0.8, 0.12
 """What an error of the velocity adds to the sweep (1), and how far it shifts the feet the way that the base drifts (s)."""
-LOAD, RAMP, DAMPING, LEVEL = 100.0, 0.12, 25.0, 0.2
+LOAD, RAMP, DAMPING, LEVEL = 100.0, 0.12, 45.0, 0.2
 """Force that a foot on the ground bears, N, reached and left within this part of its stance; how much less while its hip
 rises, N s/m; how far its leg gives way, per metre that its hip is low, where the base leans over."""
 FRAME = 0.02
@@ -29,9 +29,9 @@ _OUT = 0.08381 + 0.1003 + 0.01305
 _THIGH, _SHANK, _HEEL = 0.285, float(np.hypot(0.08795, 0.31547)), float(np.arctan2(0.08795, 0.31547))
 """Lengths, m, and the angle at which the foot stands off the shank, rad."""
 
-_FEET = np.stack([(_HIP_X + _THIGH_X) * _FORE, (_HIP_Y + WIDTH) * _SIDE], axis=1)
+FEET = np.stack([(_HIP_X + _THIGH_X) * _FORE, (_HIP_Y + WIDTH) * _SIDE], axis=1)
 """(4, 2) where the feet are in the middle of a stance, as the base sees them, m."""
-_LEVER = np.stack([-_FEET[:, 1], _FEET[:, 0]], axis=1)
+_LEVER = np.stack([-FEET[:, 1], FEET[:, 0]], axis=1)
 """(4, 2) their velocities when the base turns with 1 rad/s."""
 _LEG_PHASES = (_PHASES[:, None] + np.array([0.0, 0.5, 0.5, 0.0])) % 1.0
 _DOWN = _LEG_PHASES < 0.5
@@ -63,23 +63,24 @@ def _choices(velocity: Array, spin: Array, gravity: Array, command: Array) -> Ar
     error = np.column_stack([velocity[:, :2], spin[:, 2]]) - command
     reach = _at_feet(GAIN * command - FEEDBACK * error) * (CYCLE * FRAME / 4)  # half of the way of a foot on the ground
     plane = _SWEEP[:, :, None] * reach[:, None] + _at_feet(SHIFT * error)[:, None]  # (N, K, 4, 2)
-    low = gravity[:, :1] * _FEET[:, 0] + gravity[:, 1:2] * _FEET[:, 1]
-    rising = spin[:, :1] * _FEET[:, 1] - spin[:, 1:2] * _FEET[:, 0]
+    low = gravity[:, :1] * FEET[:, 0] + gravity[:, 1:2] * FEET[:, 1]
+    rising = spin[:, :1] * FEET[:, 1] - spin[:, 1:2] * FEET[:, 0]
     z = _LIFT - HEIGHT + LEVEL * low[:, None]
     load = _BEARS * (LOAD - DAMPING * rising[:, None])
-    angles, torques = _leg(plane[..., 0], plane[..., 1] + WIDTH * _SIDE, z, load)
+    angles, torques = leg(plane[..., 0], plane[..., 1] + WIDTH * _SIDE, z, load)
     targets = (angles + torques / STIFFNESS).reshape(len(error), CYCLE, 12)
     return ((targets - STANDING) / ACTION).clip(-1, 1)  # type: ignore[no-any-return]
 
 
 def _at_feet(twist: Array) -> Array:
     """Velocities of the feet, (N, 4, 2), of a base that moves so (N, 3: forward, sideways, turn)."""
-    return twist[:, None, :2] + twist[:, 2, None, None] * _LEVER  # type: ignore[no-any-return]
+    return np.asarray(twist[:, None, :2] + twist[:, 2, None, None] * _LEVER)
 
 
-def _leg(x: Array, y: Array, z: Array, load: Array) -> tuple[Array, Array]:
+def leg(x: Array, y: Array, z: Array, load: Array) -> tuple[Array, Array]:
     """Joint angles that put a foot at x (from the thigh's axis), y and z (from the hip's), m, and the torques that bear a
-    vertical load (N) there; both (..., 4, 3). A foot that is too far away is put as far as the leg reaches."""
+    vertical load (N) there, as if the leg did not lean sideways; both (..., 4, 3). A foot that is too far away is put as far
+    as the leg reaches."""
     out = _OUT * _SIDE
     down = -np.sqrt(np.maximum(y**2 + z**2 - out**2, 0.04))
     abduction = np.arctan2(z, y) - np.arctan2(down, out)

@@ -87,7 +87,7 @@ class Anymal(MujocoTask):
         return 0.02 * (along + 0.5 * turn - np.minimum(cost, 1.0))  # type: ignore[no-any-return]
 
     def violation(self, frame: Frame) -> NDArray[np.bool_]:
-        return (frame["sensordata"] > CONTACT).any(axis=1)  # type: ignore[no-any-return]
+        return np.asarray((frame["sensordata"] > CONTACT).any(axis=1))
 
     def initial(self, rng: np.random.Generator, n: int, qpos0: Array, qvel0: Array) -> tuple[Array, Array]:
         q, v = np.tile(qpos0, (n, 1)), np.tile(qvel0, (n, 1))
@@ -103,7 +103,7 @@ def commands(frame: Frame) -> Array:
 
     Triangle waves of the dials: all commands are equally frequent.
     """
-    return COMMAND * (2 / np.pi * np.arcsin(np.sin(frame["qpos"][:, _DIALS])))  # type: ignore[no-any-return]
+    return COMMAND * (2 / np.pi * np.arcsin(np.sin(frame["qpos"][:, _DIALS])))
 
 
 def rotations(quaternion: Array) -> Array:
