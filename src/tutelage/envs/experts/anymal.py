@@ -9,7 +9,7 @@ from tutelage.envs.tasks.base import Array
 
 CYCLE = 14
 """Timesteps of 0.02 s in which each foot is once on the ground and once in the air, half of the time each."""
-HEIGHT, CLEARANCE, WIDTH = 0.5, 0.065, 0.23
+HEIGHT, CLEARANCE, WIDTH = 0.5, 0.085, 0.23
 """Of the hips above the middle of the feet, of a foot in the air, and from a hip's axis out to its foot, m."""
 GAIN = np.array([2.0, 1.2, 2.0])
 """How much further (forward, sideways, turning) the feet sweep than on rigid legs: theirs give way."""
