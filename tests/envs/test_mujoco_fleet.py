@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tutelage.checks import check_env
+from tutelage.envs.engine import BAD_VELOCITY, wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.tasks import TASKS, Walker2d
 from tutelage.errors import ConfigError, ContractError
@@ -187,6 +188,61 @@ def test_a_simulation_that_diverges_is_a_violation_and_its_numbers_are_kept_from
         assert np.isfinite(obs).all()
         assert np.isfinite(reward).all()
     assert info["violation"].all()
+    fleet.close()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [
+        ("qvel", np.nan, "velocity"),
+        ("qvel", 1e5, "velocity"),
+        ("qvel", 1e12, "velocity"),
+        ("qpos", np.nan, "position"),
+        ("qpos", -np.inf, "position"),
+        ("qpos", 1e7, "position"),
+    ],
+)
+@pytest.mark.parametrize("name", ["Walker2d", "Humanoid", "PegInsertion"])
+def test_unstable_physics_is_a_violation_of_that_robot_alone(name: str, field: str, value: float, reason: str) -> None:
+    fleet, calm = (MujocoFleet(name, 4, disturbance="none", threads=2) for _ in range(2))
+    before, actions = fleet.reset(seed=0)[0], np.zeros(fleet.action_space.shape or ())
+    calm.reset(seed=0)
+    getattr(fleet.physics.datas[1], field)[:] = value
+    others = np.arange(4) != 1
+    for t in range(3):
+        obs, reward, terminated, truncated, info = fleet.step(actions)
+        expected = calm.step(actions)
+        assert info["violation"].tolist() == terminated.tolist() == [False, True, False, False]
+        assert info["unstable"].tolist() == ["", reason if t == 0 else "", "", ""]
+        assert not (truncated | info["success"])[1]
+        assert np.array_equal(obs[1], before[1]), "the last good observation"
+        assert reward[1] == 0
+        for ours, theirs in ((obs, expected[0]), (reward, expected[1])):
+            assert np.array_equal(ours[others], theirs[others]), "the rest of the fleet goes on as if nothing had happened"
+        assert all(np.isfinite(part).all() for part in (obs, reward, info["return"], fleet.physics.get_state()))
+    obs, info = fleet.reset(options={"reset_mask": ~others})
+    assert not info["violation"].any()
+    assert np.isfinite(obs).all()
+    info = fleet.step(actions)[4]
+    assert not info["violation"].any(), "a hard reset mends it"
+    fleet.close()
+    calm.close()
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_physics_that_diverges_within_a_timestep_is_noticed_there(name: str) -> None:
+    fleet = MujocoFleet(name, 3, disturbance="none", threads=1)
+    fleet.reset(seed=0)
+    physics, blow = fleet.physics, np.zeros((3, 6))
+    before, blow[2] = physics.raw_frame.copy(), 1e15
+    ctrl = np.zeros((3, physics.model.nu))
+    wait(physics.advance_async(np.arange(3), ctrl, blow, fleet.task.frame_skip))
+    assert physics.unstable.tolist() == [0, 0, BAD_VELOCITY]
+    assert ((physics.raw_frame == before).all(axis=1)).tolist() == [False, False, True], "the last good frame"
+    assert np.isfinite(physics.get_state()).all()
+    physics.restart(np.array([2]), physics.qpos0[None], physics.qvel0[None])
+    wait(physics.advance_async(np.arange(3), ctrl, None, 1))
+    assert not physics.unstable.any()
     fleet.close()
 
 

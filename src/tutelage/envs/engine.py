@@ -60,6 +60,35 @@ def _claim(typing, address):  # type: ignore[no-untyped-def]
     return types.intp(types.intp), generate
 
 
+@intrinsic
+def _float_at(typing, address):  # type: ignore[no-untyped-def]
+    """The float64 at an address."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        kind = context.get_value_type(types.float64)
+        return builder.load(builder.inttoptr(arguments[0], kind.as_pointer()))
+
+    return types.float64(types.intp), generate
+
+
+STABLE, BAD_POSITION, BAD_VELOCITY = 0, 1, 2
+"""Values of `Physics.unstable`."""
+POSITION_LIMIT, SPEED_LIMIT = 1e6, 1e4
+"""Beyond these (m or rad, m/s or rad/s) a simulation is taken to have diverged: no robot is so far away or so fast."""
+
+
+@numba.njit(nogil=True, cache=True)
+def _health(qpos, nq, qvel, nv):  # type: ignore[no-untyped-def]
+    """Whether the state at these addresses is one that a robot can be in. NaN compares false, so it is not."""
+    for k in range(nv):
+        if not abs(_float_at(qvel + 8 * k)) < SPEED_LIMIT:
+            return BAD_VELOCITY
+    for k in range(nq):
+        if not abs(_float_at(qpos + 8 * k)) < POSITION_LIMIT:
+            return BAD_POSITION
+    return STABLE
+
+
 @numba.njit(nogil=True, cache=True)
 def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-untyped-def]
     """Copy robot i's fields, one behind the other, into row i of the frame (float64)."""
@@ -71,7 +100,7 @@ def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-u
 
 @numba.njit(nogil=True, cache=True)
 def _advance(  # type: ignore[no-untyped-def]
-    robots, next_one, models, datas, substeps, forces,
+    robots, next_one, models, datas, substeps, forces, unstable, qpos_at, nq, qvel_at, nv,
     ctrl_at, ctrl_address, ctrl_width, push_at, push_address, sources, sizes, frame_address, frame_width,
 ):  # fmt: skip
     while True:
@@ -81,8 +110,17 @@ def _advance(  # type: ignore[no-untyped-def]
         i = robots[claimed]
         _memmove(ctrl_at[i], ctrl_address + i * ctrl_width * 8, ctrl_width * 8)
         _memmove(push_at[i], push_address + i * 48, 48)
+        health = _health(qpos_at[i], nq, qvel_at[i], nv)
         for _ in range(substeps):
+            if health != STABLE:
+                break
             _mj_step(models[i], datas[i])
+            health = _health(qpos_at[i], nq, qvel_at[i], nv)
+        unstable[i] = health
+        if health != STABLE:
+            # Its numbers are nobody's: the frame keeps the last good ones, and nothing that is not finite stays behind.
+            _mj_reset(models[i], datas[i])
+            continue
         if forces:
             _mj_contact_forces(models[i], datas[i])
         _gather(i, sources, sizes, frame_address, frame_width)
@@ -90,7 +128,7 @@ def _advance(  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def _restart(  # type: ignore[no-untyped-def]
-    robots, next_one, models, datas,
+    robots, next_one, models, datas, unstable,
     qpos_at, qpos_address, nq, qvel_at, qvel_address, nv, sources, sizes, frame_address, frame_width,
 ):  # fmt: skip
     while True:
@@ -102,6 +140,7 @@ def _restart(  # type: ignore[no-untyped-def]
         _memmove(qpos_at[i], qpos_address + i * nq * 8, nq * 8)
         _memmove(qvel_at[i], qvel_address + i * nv * 8, nv * 8)
         _mj_forward(models[i], datas[i])
+        unstable[i] = STABLE
         _gather(i, sources, sizes, frame_address, frame_width)
 
 
@@ -121,6 +160,9 @@ class Physics:
         threads: worker threads; default: one per core this process may use.
 
     `frame[name]` is the field of all robots, shape (N, *field shape), a view that the next step overwrites.
+
+    A simulation that diverges ends in the substep in which it does: `unstable` (N,) int8 says so (`BAD_POSITION`,
+    `BAD_VELOCITY`), the robot's frame stays that before the step, and it waits for `restart`. The others do not notice.
     """
 
     def __init__(
@@ -134,11 +176,14 @@ class Physics:
         threads: int | None = None,
     ) -> None:
         self.model = mujoco.MjModel.from_xml_path(str(xml))
+        # MuJoCo would put a diverged robot back to its initial state and go on, as if nothing had happened.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.num_robots = num_robots
         self.threads = max(1, min(threads or available_cores(), num_robots))
         self.models = [self.model] * num_robots
         self.datas = [mujoco.MjData(self.model) for _ in range(num_robots)]
         self.qpos0, self.qvel0 = self.datas[0].qpos.copy(), self.datas[0].qvel.copy()
+        self.unstable = np.zeros(num_robots, dtype=np.int8)
         self._forces = contact_forces
         self._push_body = self.model.body(push_body).id
         self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
@@ -195,7 +240,8 @@ class Physics:
         self._push[:] = 0.0 if push is None else push
         return self._spread(
             _advance, robots,
-            self._models_at, self._datas_at, substeps, self._forces,
+            self._models_at, self._datas_at, substeps, self._forces, self.unstable,
+            self._qpos_at, self.model.nq, self._qvel_at, self.model.nv,
             self._ctrl_at, _address(self._ctrl), self.model.nu, self._push_at, _address(self._push),
             self._sources, self._sizes, _address(self._frame), self._width,
         )  # fmt: skip
@@ -205,7 +251,7 @@ class Physics:
         self._qpos[robots], self._qvel[robots] = qpos, qvel
         futures = self._spread(
             _restart, robots,
-            self._models_at, self._datas_at,
+            self._models_at, self._datas_at, self.unstable,
             self._qpos_at, _address(self._qpos), self.model.nq, self._qvel_at, _address(self._qvel), self.model.nv,
             self._sources, self._sizes, _address(self._frame), self._width,
         )  # fmt: skip

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from tutelage.envs.disturbance import Disturbance, Pusher, parse
-from tutelage.envs.engine import Physics, wait
+from tutelage.envs.engine import BAD_POSITION, BAD_VELOCITY, STABLE, Physics, wait
 from tutelage.envs.tasks import TASKS
 from tutelage.envs.tasks.base import Array, GoalTask, MujocoTask
 from tutelage.errors import ConfigError, ContractError
@@ -20,10 +20,18 @@ from tutelage.seeding import rng_state, set_rng_state
 
 PIXELS = 64
 """Height and width of the images that a policy sees (section 3.5)."""
+BAD_OBSERVATION = 3
+UNSTABLE = np.array([""] * 4, dtype="<U11")
+"""`info["unstable"]`: which of a robot's numbers became unusable in this step; "" for all others."""
+UNSTABLE[[BAD_POSITION, BAD_VELOCITY, BAD_OBSERVATION]] = "position", "velocity", "observation"
 
 
 class MujocoFleet(Fleet):
     """A fleet of MuJoCo robots; see `Fleet` for the contract.
+
+    A robot whose simulation diverges (a number that is not finite, or larger than any robot's) is in violation, like one
+    that fell, and keeps its last good observation; `info["unstable"]` (N,) str of that step says what diverged: "position",
+    "velocity" or "observation". The other robots do not notice.
 
     Args:
         task: a `MujocoTask` or the name of one ("Walker2d").
@@ -149,7 +157,10 @@ class MujocoFleet(Fleet):
         wait(futures)
         frame = self.physics.frame
         obs = self.task.observe(frame)
-        sane = np.isfinite(obs).all(axis=1)  # a simulation that diverged is a violation, and its numbers are nobody's
+        # A simulation that diverged is a violation, and its numbers are nobody's.
+        unstable = np.where(moving, self.physics.unstable, STABLE)
+        unstable[moving & (unstable == STABLE) & ~np.isfinite(obs).all(axis=1)] = BAD_OBSERVATION
+        sane = unstable == STABLE
         fell = self.task.violation(frame) | ~sane
         position = self.task.forward(frame, self._body_mass)
         reward = np.where(moving & sane, self.task.reward(frame, (position - self._position) / self.dt, actions), 0.0)
@@ -170,6 +181,7 @@ class MujocoFleet(Fleet):
             "success": success,
             "return": self._return.copy(),
             "elapsed": self._elapsed.copy(),
+            "unstable": UNSTABLE[unstable],
         }
         seen, info = self._seen(info)
         return seen, reward, self._violation.copy(), truncated, info
