@@ -43,7 +43,8 @@ class Outcome:
 def environment() -> dict[str, str]:
     """That of a terminal without colours, in which `tutelage` and `python` are those of this interpreter."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    return {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "PATH": path, "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": "."}
+    modules = os.pathsep.join([".", *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "PATH": path, "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": modules}
 
 
 def execute(command: list[str], folder: Path) -> Outcome:
