@@ -19,7 +19,6 @@ from small import FLAGS, assert_same, points, walker
 import tutelage
 from tutelage import cli
 from tutelage.envs.tasks import TASKS
-from tutelage.envs.tasks import TASKS
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.recording import lock
 from tutelage.experiments.run import Run
