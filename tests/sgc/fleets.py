@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from members import Fleet
+from sgc import members
 
+from tutelage.sgc.home import Home
 from tutelage.sgc.rules import Role
 
 
@@ -57,14 +58,18 @@ def _text(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
-def make_fleet(folder: Path, policy: str, nodes: Iterable[str], routers: Iterable[str] = ()) -> Fleet:
-    """A fleet whose keys are still to be handed out."""
-    text = policy if "version = 1" in policy else f"version = 1\n{policy}"
-    fleet = Fleet(folder, nodes, text, share=False)
-    for name in routers:
-        fleet.join(name, Role.ROUTER)
-    fleet.publish(text)
-    return fleet
+class Fleet(members.Fleet):
+    """A fleet whose keys are still to be handed out, with routers. `fleet["arm"]` is a home."""
+
+    def __init__(self, folder: Path, policy: str, nodes: Iterable[str], routers: Iterable[str] = ()) -> None:
+        text = policy if "version = 1" in policy else f"version = 1\n{policy}"
+        super().__init__(folder, nodes, text, share=False)
+        for name in routers:
+            self.join(name, Role.ROUTER)
+        self.publish(text)
+
+    def __getitem__(self, name: str) -> Home:
+        return self.homes[name]
 
 
 def free_port() -> int:

@@ -12,11 +12,10 @@ import time
 from pathlib import Path
 
 import pytest
-from fleets import eventually, make_fleet, service, topic
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
-from members import Fleet
+from sgc.fleets import Fleet, eventually, service, topic
 
 from tutelage.sgc import delivery, lanes
 from tutelage.sgc.messages import Message
@@ -67,8 +66,8 @@ class HostileRouter(RuleBasedStateMachine):
     def come_up(self, mode: str) -> None:
         self.network = Network()
         self.alias = f"log-{mode}"
-        self.arm = Node.open(self.fleet.homes["arm"], MemoryTransport(self.network))
-        self.server = Node.open(self.fleet.homes["server"], MemoryTransport(self.network))
+        self.arm = Node.open(self.fleet["arm"], MemoryTransport(self.network))
+        self.server = Node.open(self.fleet["server"], MemoryTransport(self.network))
         self.got: list[int] = []
         self.strange: list[Message] = []
         self.subscription = self.server.subscribe(self.alias, self.hear)
@@ -160,7 +159,7 @@ class HostileRouter(RuleBasedStateMachine):
 
 @pytest.fixture(scope="module", autouse=True)
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    HostileRouter.fleet = make_fleet(Path(tempfile.mkdtemp(dir=tmp_path_factory.mktemp("h"))), POLICY, ["arm", "server"])
+    HostileRouter.fleet = Fleet(Path(tempfile.mkdtemp(dir=tmp_path_factory.mktemp("h"))), POLICY, ["arm", "server"])
     HostileRouter.fleet.share()
     return HostileRouter.fleet
 
@@ -180,8 +179,8 @@ def test_one_packet_in_ten_lost_is_nothing_lost(fleet: Fleet, mode: str) -> None
         return [] if seen[0] % 10 == 0 else [(key, packet)]
 
     with (
-        Node.open(fleet.homes["arm"], MemoryTransport(network)) as arm,
-        Node.open(fleet.homes["server"], MemoryTransport(network)) as server,
+        Node.open(fleet["arm"], MemoryTransport(network)) as arm,
+        Node.open(fleet["server"], MemoryTransport(network)) as server,
     ):
         got: list[bytes] = []
         subscription = server.subscribe(f"log-{mode}", lambda message: got.append(message.payload))
@@ -200,8 +199,8 @@ def test_one_packet_in_ten_lost_is_nothing_lost(fleet: Fleet, mode: str) -> None
 def test_junk_in_place_of_requests_and_answers_is_refused(fleet: Fleet) -> None:
     network = Network()
     with (
-        Node.open(fleet.homes["arm"], MemoryTransport(network)) as arm,
-        Node.open(fleet.homes["server"], MemoryTransport(network)) as server,
+        Node.open(fleet["arm"], MemoryTransport(network)) as arm,
+        Node.open(fleet["server"], MemoryTransport(network)) as server,
         server.serve("grasp", lambda asked: b"done"),
     ):
         assert arm.request("grasp", b"") == b"done"
@@ -224,8 +223,8 @@ def test_a_router_that_never_gives_what_is_missing_delays_but_does_not_stop(
     monkeypatch.setattr(delivery, "PATIENCE", 0.3)
     network = Network()
     with (
-        Node.open(fleet.homes["arm"], MemoryTransport(network)) as arm,
-        Node.open(fleet.homes["server"], MemoryTransport(network)) as server,
+        Node.open(fleet["arm"], MemoryTransport(network)) as arm,
+        Node.open(fleet["server"], MemoryTransport(network)) as server,
     ):
         got: list[bytes] = []
         subscription = server.subscribe("log-signature", lambda message: got.append(message.payload))

@@ -6,10 +6,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import netlab
 import pytest
-from fleets import Heard, Programs, eventually, make_fleet, topic
-from members import Fleet
+from sgc import netlab
+from sgc.fleets import Fleet, Heard, Programs, eventually, topic
 
 from tutelage.sgc.rules import Role
 from tutelage.sgc.transport.config import Endpoint, NetworkConfig
@@ -28,7 +27,7 @@ def lab() -> Iterator[netlab.Lab]:
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Fleet:
-    made = make_fleet(tmp_path, POLICY, ["robot", "server"])
+    made = Fleet(tmp_path, POLICY, ["robot", "server"])
     made.join("router", Role.ROUTER, addresses=(netlab.ROUTER,))
     made.publish((tmp_path / "authority" / "policy.toml").read_text())
     return made
@@ -45,7 +44,7 @@ def start(lab: netlab.Lab, fleet: Fleet, programs: Programs, protocol: str) -> N
     for name in ("robot", "server"):
         NetworkConfig((Endpoint.parse(f"{protocol}/{netlab.ROUTER}:7447"),)).save(fleet.homes[name].path)
     where = f"{protocol}/0.0.0.0:7447"
-    programs.start("route", fleet.homes["router"].path, where, inside=lab.inside("router"))
+    programs.start("route", fleet["router"].path, where, inside=lab.inside("router"))
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic", "wss"])
@@ -53,10 +52,10 @@ def test_both_sides_behind_translation_reach_each_other(
     lab: netlab.Lab, fleet: Fleet, programs: Programs, protocol: str
 ) -> None:
     start(lab, fleet, programs, protocol)
-    at_server = programs.start("listen", fleet.homes["server"].path, "log", inside=lab.inside("server"))
-    at_robot = programs.start("listen", fleet.homes["robot"].path, "command", inside=lab.inside("robot"))
-    programs.start("publish", fleet.homes["robot"].path, "log", 0.01, inside=lab.inside("robot"))
-    programs.start("publish", fleet.homes["server"].path, "command", 0.01, inside=lab.inside("server"))
+    at_server = programs.start("listen", fleet["server"].path, "log", inside=lab.inside("server"))
+    at_robot = programs.start("listen", fleet["robot"].path, "command", inside=lab.inside("robot"))
+    programs.start("publish", fleet["robot"].path, "log", 0.01, inside=lab.inside("robot"))
+    programs.start("publish", fleet["server"].path, "command", 0.01, inside=lab.inside("server"))
     for listener in (at_server, at_robot):
         eventually(lambda listener=listener: len(Heard.of(listener).numbers) > 50)
         assert Heard.of(listener).in_order
@@ -67,8 +66,8 @@ def test_a_robot_that_moves_to_another_address_is_missed_only_for_a_moment(
     lab: netlab.Lab, fleet: Fleet, programs: Programs, protocol: str, limit: float
 ) -> None:
     start(lab, fleet, programs, protocol)
-    listener = programs.start("listen", fleet.homes["server"].path, "log", inside=lab.inside("server"))
-    programs.start("publish", fleet.homes["robot"].path, "log", 0.01, inside=lab.inside("robot"))
+    listener = programs.start("listen", fleet["server"].path, "log", inside=lab.inside("server"))
+    programs.start("publish", fleet["robot"].path, "log", 0.01, inside=lab.inside("robot"))
     eventually(lambda: len(Heard.of(listener).numbers) > 100)
     moved = time.monotonic()
     lab.move_robot()

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from fleets import eventually, make_fleet, service, topic
-from members import Fleet
+from sgc.fleets import Fleet, eventually, service, topic
 
 from tutelage.errors import ConfigError
 from tutelage.sgc import publisher as publishing
@@ -33,7 +32,7 @@ POLICY = (
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    return make_fleet(tmp_path_factory.mktemp("fleet"), POLICY, ["arm", "server", "late"])
+    return Fleet(tmp_path_factory.mktemp("fleet"), POLICY, ["arm", "server", "late"])
 
 
 @pytest.fixture
@@ -43,13 +42,13 @@ def network() -> Network:
 
 @pytest.fixture
 def arm(fleet: Fleet, network: Network) -> Iterator[Node]:
-    with Node.open(fleet.homes["arm"], MemoryTransport(network)) as node:
+    with Node.open(fleet["arm"], MemoryTransport(network)) as node:
         yield node
 
 
 @pytest.fixture
 def server(fleet: Fleet, network: Network) -> Iterator[Node]:
-    with Node.open(fleet.homes["server"], MemoryTransport(network)) as node:
+    with Node.open(fleet["server"], MemoryTransport(network)) as node:
         yield node
 
 
@@ -114,14 +113,14 @@ def test_iterating_over_a_subscription(arm: Node, server: Node) -> None:
 
 
 def test_messages_wait_for_the_key_until_its_owner_is_there(tmp_path: Path, network: Network) -> None:
-    fleet = make_fleet(tmp_path, POLICY, ["arm", "server"])
-    with Node.open(fleet.homes["server"], MemoryTransport(network)) as server:
+    fleet = Fleet(tmp_path, POLICY, ["arm", "server"])
+    with Node.open(fleet["server"], MemoryTransport(network)) as server:
         got = Received()
         server.subscribe("shared", got)
         server.publisher("shared").send(b"0")
         time.sleep(0.2)
         assert got == []
-        with Node.open(fleet.homes["arm"], MemoryTransport(network)):
+        with Node.open(fleet["arm"], MemoryTransport(network)):
             eventually(lambda: in_order(got, 1))
 
 
@@ -167,7 +166,7 @@ def test_the_last_message_is_not_missed_either(network: Network, arm: Node, serv
 def test_a_publisher_that_is_gone_leaves_a_counted_gap(fleet: Fleet, network: Network, server: Node) -> None:
     got = Received()
     subscription = server.subscribe("log-signature", got)
-    with Node.open(fleet.homes["arm"], MemoryTransport(network)) as arm:
+    with Node.open(fleet["arm"], MemoryTransport(network)) as arm:
         log = arm.publisher("log-signature")
         acquainted(log.send, got)
         log.send(b"0")
@@ -189,7 +188,7 @@ def test_a_restarted_publisher_is_heard_at_once(fleet: Fleet, network: Network, 
     got = Received()
     server.subscribe("log-signature", got)
     for k in range(3):
-        with Node.open(fleet.homes["arm"], MemoryTransport(network)) as arm:
+        with Node.open(fleet["arm"], MemoryTransport(network)) as arm:
             arm.publisher("log-signature").send(b"%d" % k)
             eventually(lambda k=k: in_order(got, k + 1))
 
@@ -355,8 +354,8 @@ def test_a_message_that_is_too_large_is_refused(arm: Node, monkeypatch: pytest.M
 
 
 def test_an_expired_certificate_stops_a_node_with_the_remedy(tmp_path: Path, network: Network) -> None:
-    fleet = make_fleet(tmp_path, POLICY, ["arm"])
-    home = fleet.homes["arm"]
+    fleet = Fleet(tmp_path, POLICY, ["arm"])
+    home = fleet["arm"]
     home.accept(fleet.authority.issue(home.request(), hours=1 / 3600))
     time.sleep(1.1)
     with pytest.raises(NotIssued, match="the certificate of arm expired"):
@@ -364,11 +363,11 @@ def test_an_expired_certificate_stops_a_node_with_the_remedy(tmp_path: Path, net
 
 
 def test_a_revoked_node_hears_nothing_more(tmp_path: Path, network: Network) -> None:
-    fleet = make_fleet(tmp_path, POLICY, ["arm", "server", "late"])
+    fleet = Fleet(tmp_path, POLICY, ["arm", "server", "late"])
     with (
-        Node.open(fleet.homes["arm"], MemoryTransport(network)) as arm,
-        Node.open(fleet.homes["server"], MemoryTransport(network)) as server,
-        Node.open(fleet.homes["late"], MemoryTransport(network)) as thief,
+        Node.open(fleet["arm"], MemoryTransport(network)) as arm,
+        Node.open(fleet["server"], MemoryTransport(network)) as server,
+        Node.open(fleet["late"], MemoryTransport(network)) as thief,
     ):
         heard, stolen = Received(), Received()
         server.subscribe("log-signature", heard)
@@ -377,7 +376,7 @@ def test_a_revoked_node_hears_nothing_more(tmp_path: Path, network: Network) -> 
         acquainted(log.send, heard)
         acquainted(log.send, stolen)
         # Only the owner hears of it, and no router does anything: the key changes, and the thief gets none.
-        fleet.homes["arm"].accept(fleet.authority.revoke("late"))
+        fleet["arm"].accept(fleet.authority.revoke("late"))
         epoch = arm.keyring.epoch("log-signature")
         eventually(lambda: arm.keyring.epoch("log-signature") != epoch)
         eventually(lambda: server.keyring.epoch("log-signature") == arm.keyring.epoch("log-signature"))
@@ -387,4 +386,4 @@ def test_a_revoked_node_hears_nothing_more(tmp_path: Path, network: Network) -> 
             log.send(b"%d" % k)
         eventually(lambda: in_order(heard, 20))
         assert stolen == []
-        eventually(lambda: fleet.homes["server"].deny_notice is not None)  # passed on among the nodes
+        eventually(lambda: fleet["server"].deny_notice is not None)  # passed on among the nodes

@@ -17,7 +17,7 @@ from tutelage.sgc.reasons import Reason, Refused
 
 PACKETS = 4096
 BYTES = 64 << 20
-ANSWER = 1 << 20
+ANSWER = 256 << 10
 """Bytes of an answer, unless a single packet is larger."""
 RANGES = 64
 """Of a request."""

@@ -44,8 +44,9 @@ FOR_GOOD = frozenset(
 )
 """Refusals that fetching a packet again does not change."""
 
-ANSWER_TIMEOUT = 1.0
-"""Seconds to wait for a publisher to send what is missing."""
+ANSWER_TIMEOUT = 0.5, 4.0
+"""Seconds to wait for a publisher to send what is missing: at first, and at most. It doubles when nothing comes: the way may
+be slow, or the question went down with a connection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +123,7 @@ class Subscription:
         self._held: deque[tuple[float, bytes]] = deque(maxlen=HELD_PACKETS)
         self._asked: dict[str, float] = {}
         self._last_refusal: Reason | None = None
+        self._timeouts: dict[bytes, float] = {}
         self._offer_at = float("inf")
         self._out: queues.Queue[Message | None] = queues.Queue(self._limit)
         self._closed = threading.Event()
@@ -365,12 +367,14 @@ class Subscription:
 
     def _ask(self, salt: bytes, ranges: list[tuple[int, int]]) -> None:
         """On the pool: ask the publisher for what is missing."""
-        repair = _Repair(salt, 0, [])
+        repair, first = _Repair(salt, 0, []), ANSWER_TIMEOUT[0]
+        timeout = self._timeouts.get(salt, first)
         try:
             key = lanes.key(self._entry.name, lanes.REPLAY, salt.hex())
-            repair = _Repair(salt, *parse_answer(self._transport.request(key, make_request(ranges), ANSWER_TIMEOUT)))
+            repair = _Repair(salt, *parse_answer(self._transport.request(key, make_request(ranges), timeout)))
+            self._timeouts.pop(salt, None)
         except NoReply:
-            pass
+            self._timeouts = {salt: min(2 * timeout, ANSWER_TIMEOUT[1])}  # of the stream in trouble; others begin anew
         except Refused as refused:
             self.opener.refusals.add(refused.reason)
         self._inbox.put(repair)
