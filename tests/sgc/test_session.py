@@ -134,14 +134,14 @@ def test_sessions_are_few_and_those_of_one_node_do_not_push_out_others(fleet: Fl
 
 
 def test_a_session_ends_with_the_certificate_and_with_revocation(fleet: Fleet) -> None:
-    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    sealer, opener = fleet.pair("teleop", "operator-2", "server")
     opener.open(sealer.seal(b"x"))
     other = fleet.opener("drone-1", "teleop")
     other.complete_session(sealer.accept_session(other.offer_session()))
-    fleet.revoke("drone-1", tell=["operator-1"])
+    fleet.revoke("drone-1", tell=["operator-2"])
     opener.open(sealer.seal(b"x"))
     assert sealer.receivers() == ["server"]
-    fleet.revoke("operator-1", tell=["server"])
+    fleet.revoke("operator-2", tell=["server"])
     assert reason(opener.open, sealer.seal(b"x")) == Reason.REVOKED
 
 

@@ -152,7 +152,7 @@ class Opener:
             return self._anchor(stream, BARE_PROOF, header, raw, packet[end:], member, now)
         body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
         if self._authenticity == Authenticity.SESSION:
-            member = self._session_member(header, raw, packet, end, now)
+            member = self._session_member(stream, header, raw, packet, end, now)
         else:
             member = self._member(stream, header, raw, packet[HEADER:start], now)
         messages = self._messages(header, raw, member, body)
@@ -268,12 +268,13 @@ class Opener:
         self._check(member, now)
         return member
 
-    def _session_member(self, header: Header, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
+    def _session_member(self, stream: _Stream, header: Header, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
         for ident, tag in slots(packet[end:]):
             session = self._sessions.get((header.sender, header.salt, ident))
             if session is not None and now / 1e9 < session.until:
                 session.check(raw, packet[:end], tag)
-                self._check(session.member, now)
+                if session.member is not stream.member:  # else `_stream` has checked it
+                    self._check(session.member, now)
                 return session.member
         raise Refused(Reason.NO_SESSION, f"a packet of {self.alias} by a sender with whom no session is open")
 
@@ -295,6 +296,7 @@ class Opener:
                 self._entry = self._home.access.check(self.alias, self.lane, sends=False)
                 if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
                     raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
+                self._replay.set_max_age(self._entry.rule.max_age)
             self._versions, self._looked = versions, now
             self._look_count += 1
 

@@ -66,9 +66,9 @@ class Header(NamedTuple):
     first: int
     sent: int
 
-    def pack(self) -> bytes:
-        """As bytes."""
-        return _HEADER.pack(*self)
+
+make_header = _HEADER.pack
+"""The fields of `Header` as bytes."""
 
 
 def read_header(packet: memoryview, mode: int) -> Header:

@@ -30,10 +30,10 @@ from tutelage.sgc.packet import (
     TAG,
     VERSION,
     Buffer,
-    Header,
     Packet,
     Statements,
     join_batch,
+    make_header,
     message_key,
     nonce,
 )
@@ -42,6 +42,7 @@ from tutelage.sgc.rules import Authenticity, Lane
 from tutelage.sgc.session import MAX_SESSIONS, SLOT, Handshake, Session, tags
 
 _SIGNATURE = 64
+_SMALL = 65_536  # bytes up to which copying is cheaper than writing in place
 _LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys, certificate and policy
 
 
@@ -179,7 +180,10 @@ class Sealer:
                 flags |= ANCHOR
             introduced = len(introduction) + TAG if introduction else 0
             header = self._header(flags, first, introduced, self._proof_bytes(flags), now)
-            start = HEADER + introduced
+            if not introduced and len(body) <= _SMALL:
+                sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind)
+                return sealed + self._proof(cipher, header, bind, body, flags, first, sealed, now)
+            start = HEADER + introduced  # of the ciphertext; written in place, as every copy of a large message counts
             packet = bytearray(start + len(body) + TAG)
             packet[:HEADER] = header
             with memoryview(packet) as view:
@@ -197,7 +201,7 @@ class Sealer:
         return self._link.proof_bytes(with_message=True) + TAG if flags & ANCHOR else 0
 
     def _proof(
-        self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: bytearray, now: int
+        self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Packet, now: int
     ) -> bytes:
         if self._authenticity == Authenticity.SESSION:
             return tags(self._sessions, header, sealed)
@@ -214,7 +218,7 @@ class Sealer:
 
     def _header(self, flags: int, first: int, introduction: int, proof: int, now: int) -> bytes:
         mode = MODES[self._authenticity]
-        return Header(VERSION, mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now).pack()
+        return make_header(VERSION, mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now)
 
     def _look(self, now: int) -> AESGCM:
         """The cipher to use now. Looks from time to time, and at every change, whether this node may still send."""
