@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tyro.conf import Positional
@@ -176,6 +173,7 @@ def _size(routes: Routes) -> str:
 
 def _run(node: Node, proxy: _Proxy, what: str, health: str | None) -> None:
     """Say what runs, then wait for Ctrl-C or SIGTERM."""
+    from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.health import HealthServer, node_health
 
     with contextlib.ExitStack() as stack:
@@ -183,21 +181,6 @@ def _run(node: Node, proxy: _Proxy, what: str, health: str | None) -> None:
             stack.enter_context(
                 HealthServer(health, lambda: node_health(node), lambda: {**node.counters(), "proxy": proxy.counters()})
             )
-        stop = stack.enter_context(_until_stopped())
+        stop = stack.enter_context(until_stopped())
         print(f"{node.name}: {what}; Ctrl-C ends it", flush=True)
         stop.wait()
-
-
-@contextlib.contextmanager
-def _until_stopped() -> Iterator[threading.Event]:
-    stop = threading.Event()
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
