@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.timing import machine
 
-NAMES = ("loop", "allocation", "engine", "gates", "memory", "sealing", "connectivity")
+NAMES = ("loop", "allocation", "engine", "gates", "memory", "sealing", "proxies", "connectivity")
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ the station wants the newest image, not all of them. Run with `python examples/0
 import os
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 
 from tutelage.sgc.local import LocalFleet
@@ -68,7 +69,7 @@ with (
     until = time.monotonic() + 10
     while len(positions) < 300 and time.monotonic() < until:
         time.sleep(0.01)
-    gap = max(b - a for a, b in zip(arrivals, arrivals[1:], strict=False))
+    gap = max(b - a for a, b in pairwise(arrivals))
     print(
         f"{len(positions)} of 300 positions arrived, in order: {positions == sorted(positions)}; longest silence {gap:.2f} s"
     )

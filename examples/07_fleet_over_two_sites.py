@@ -1,9 +1,8 @@
 """Four arms at two sites, one policy on a server elsewhere, and a person who helps from a third place (scenario C).
 
-Each site has a router of its own; the routers are joined. Every arm sends what it sees and gets its next action; the arm whose
-policy is least sure is handed to the person, who drives it over a session (nobody else could have sent those commands). What
-the person did is data for everybody. The arms here are points that should reach a goal. Run with
-`python examples/07_fleet_over_two_sites.py`.
+Each site has a router of its own; the routers are joined. Every arm sends what it sees and gets its next action; the arm
+whose policy is least sure is handed to the person, who drives it over a session: nobody else could have sent those commands.
+The arms here are points that should reach a goal. Run with `python examples/07_fleet_over_two_sites.py`.
 """
 
 import tempfile
