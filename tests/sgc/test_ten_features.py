@@ -289,5 +289,6 @@ def test_10_efficient_message_processing_and_routing(fleet: Fleet, mesh: list[st
         assert state.queued == QUEUE_MESSAGES
         gate.set()
         eventually(lambda: len(got) >= QUEUE_MESSAGES)
-        assert sorted(map(int, got)) == list(range(len(got)))
+        numbers = sorted(int(payload) for payload in got if payload != b"-")
+        assert numbers == list(range(len(numbers)))
         assert state.packets - packets < 20
