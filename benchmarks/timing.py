@@ -95,7 +95,8 @@ def machine() -> dict[str, Any]:
     models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")] \
         if info.exists() else []  # fmt: skip
     names = ("tutelage", "numpy", "torch", "mujoco", "gymnasium", "numba", "cryptography")
-    packages = {name: metadata.version(name) for name in names}
+    there = {found.name.lower() for found in metadata.distributions() if found.name}
+    packages = {name: metadata.version(name) for name in names if name in there}
     return {
         "processor": models[0] if models else platform.processor(),
         "cores": cores,

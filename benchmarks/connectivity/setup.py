@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.connectivity.stacks import FAR, NEAR
-from tutelage.sgc.authority import Authority
-from tutelage.sgc.home import Home
-from tutelage.sgc.rules import Role
+from tutelage.sgc.local import LocalFleet
 from tutelage.sgc.transport.config import Endpoint, NetworkConfig
 
 LOOPBACK = """<CycloneDDS><Domain Id="any">
@@ -48,19 +46,6 @@ def policy() -> str:
     return "\n".join(tables)
 
 
-def make_fleet(folder: Path) -> dict[str, Home]:
-    """Homes of two nodes and a router."""
-    authority = Authority.create(folder / "authority", "benchmark")
-    homes = {name: Home.create(folder / name, name) for name in (NEAR, FAR)}
-    homes["router"] = Home.create(folder / "router", "router", role=Role.ROUTER, addresses=("127.0.0.1",))
-    for home in homes.values():
-        home.accept(authority.issue(home.request()))
-    (authority.path / "policy.toml").write_text(policy())
-    for name, bundle in authority.publish().items():
-        homes[name].accept(bundle)
-    return homes
-
-
 def free_ports(count: int) -> list[int]:
     """Ports of loopback that nobody uses, TCP and UDP."""
     import socket
@@ -78,7 +63,7 @@ def free_ports(count: int) -> list[int]:
 def prepare(folder: Path) -> Iterator[dict[str, Any]]:
     """What all processes are told; routers run in processes of their own until the end."""
     os.environ["CYCLONEDDS_URI"] = LOOPBACK
-    homes = make_fleet(folder)
+    homes = LocalFleet(folder, policy(), (NEAR, FAR)).homes
     sockets, rosbridge, tcp, tls, quic = free_ports(5)
     for name in (NEAR, FAR):
         NetworkConfig((Endpoint("tls", "127.0.0.1", tls),)).save(homes[name].path)
@@ -93,7 +78,7 @@ def prepare(folder: Path) -> Iterator[dict[str, Any]]:
     with ExitStack() as stack:
         for arguments in (
             ("plain", str(tcp)),
-            (str(homes["router"].path), f"tls/127.0.0.1:{tls}", f"quic/127.0.0.1:{quic}"),
+            (str(homes["router-1"].path), f"tls/127.0.0.1:{tls}", f"quic/127.0.0.1:{quic}"),
         ):
             command = [sys.executable, "-m", "benchmarks.connectivity.route", *arguments]
             router = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)

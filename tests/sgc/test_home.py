@@ -37,7 +37,7 @@ def test_secrets_are_for_the_owner_only(fleet: Fleet) -> None:
     home = fleet.homes["drone-1"]
     fleet.keyrings["drone-1"].epoch("camera")
     assert stat.S_IMODE(home.path.stat().st_mode) == 0o700
-    for name in ("signing.key", "sealing.key", "bundle", "keys/camera"):
+    for name in ("signing.key", "sealing.key", "bundle", "keys/camera.keys"):
         assert stat.S_IMODE((home.path / name).stat().st_mode) == 0o600, name
 
 

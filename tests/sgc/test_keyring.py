@@ -59,7 +59,7 @@ def test_the_owner_has_a_key_and_members_get_it_by_asking(fleet: Fleet) -> None:
 
 def test_a_key_is_kept_over_a_restart_sealed_to_the_node(fleet: Fleet) -> None:
     give(fleet, "server")
-    key, file = fleet.keyrings["server"].sealing("camera").key, fleet.homes["server"].path / "keys" / "camera"
+    key, file = fleet.keyrings["server"].sealing("camera").key, fleet.homes["server"].path / "keys" / "camera.keys"
     assert Keyring(Home.open(fleet.homes["server"].path)).sealing("camera").key == key
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert key not in file.read_bytes()
@@ -68,7 +68,7 @@ def test_a_key_is_kept_over_a_restart_sealed_to_the_node(fleet: Fleet) -> None:
 
 def test_a_damaged_file_of_keys_is_asked_for_again(fleet: Fleet) -> None:
     give(fleet, "server")
-    (fleet.homes["server"].path / "keys" / "camera").write_bytes(b"?")
+    (fleet.homes["server"].path / "keys" / "camera.keys").write_bytes(b"?")
     again = Keyring(Home.open(fleet.homes["server"].path))
     assert again.epoch("camera") is None
     assert "camera" in again.wanted()
@@ -159,7 +159,7 @@ def test_a_first_key_must_have_been_asked_for(fleet: Fleet) -> None:
     """A grant that a router kept and pushes to a node that knows nothing yet."""
     give(fleet, "server")
     push = next(push for push in fleet.keyrings["drone-1"].rotate("camera") if push.node == "server")
-    (fleet.homes["server"].path / "keys" / "camera").unlink()
+    (fleet.homes["server"].path / "keys" / "camera.keys").unlink()
     fresh = Keyring(fleet.homes["server"])
     assert reason(fresh.accept, "camera", push.grant) == Reason.NOT_FOR_US  # sealed to a key of the former start
     fresh._reply_to = fleet.keyrings["server"]._reply_to
@@ -283,7 +283,7 @@ def test_a_node_that_lost_its_right_gets_no_further_key(fleet: Fleet) -> None:
     assert {push.node for push in pushes if push.alias == "camera"} == {"server"}
     assert fleet.keyrings["drone-1"].epoch("camera") > old
     fleet.keyrings["operator-1"].tend()
-    assert not (fleet.homes["operator-1"].path / "keys" / "camera").exists()
+    assert not (fleet.homes["operator-1"].path / "keys" / "camera.keys").exists()
     with pytest.raises(NotAllowed):
         fleet.keyrings["operator-1"].epoch("camera")
 

@@ -387,3 +387,24 @@ def test_a_revoked_node_hears_nothing_more(tmp_path: Path, network: Network) -> 
         eventually(lambda: in_order(heard, 20))
         assert stolen == []
         eventually(lambda: fleet["server"].deny_notice is not None)  # passed on among the nodes
+
+
+def test_a_new_policy_takes_effect_while_nodes_run(tmp_path: Path, network: Network) -> None:
+    fleet = Fleet(tmp_path, topic("log", ["arm"], ["server"]), ["arm", "server"])
+    with (
+        Node.open(fleet["arm"], MemoryTransport(network)) as arm,
+        Node.open(fleet["server"], MemoryTransport(network)) as server,
+    ):
+        got = Received()
+        server.subscribe("log", got)
+        acquainted(arm.publisher("log").send, got)
+        with pytest.raises(NotAllowed):
+            server.publisher("command")
+        fleet.publish("version = 1\n" + topic("command", ["server"], ["arm"]))
+        arrived = Received()
+        arm.subscribe("command", arrived)
+        server.publisher("command").send(b"0")
+        eventually(lambda: in_order(arrived, 1))
+        eventually(lambda: arm.peers()[0].topics == ("command",))
+        with pytest.raises(NotAllowed):
+            arm.publisher("log").send(b"1") or time.sleep(0.5) or arm.publisher("log").send(b"2")

@@ -13,8 +13,7 @@ import pytest
 
 zenoh = pytest.importorskip("zenoh", reason="needs the extra sgc")
 
-from fleets import eventually, free_port, make_fleet, topic  # noqa: E402
-from members import Fleet  # noqa: E402
+from fleets import Fleet, eventually, free_port, topic  # noqa: E402
 
 from tutelage.cli import main  # noqa: E402
 from tutelage.sgc import lanes  # noqa: E402
@@ -29,7 +28,7 @@ POLICY = 'version = 1\nrenewals = "office"\n' + topic("log", ["arm"], ["server"]
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Fleet:
-    return make_fleet(tmp_path, POLICY, ["office", "arm", "server"], ["router-1"])
+    return Fleet(tmp_path, POLICY, ["office", "arm", "server"], ["router-1"])
 
 
 @pytest.fixture

@@ -264,6 +264,15 @@ def test_a_change_of_policy_takes_effect_while_running(own_fleet: Fleet) -> None
     assert reason(opener.open, own_fleet.sealer("drone-1", "camera").seal(b"x")) == Reason.NOT_ALLOWED
 
 
+def test_a_change_of_the_maximum_age_takes_effect_while_running(own_fleet: Fleet) -> None:
+    sealer, opener = own_fleet.pair("camera", "drone-1", "server")
+    now = time.time_ns()
+    opener.open(sealer.seal(b"x", now=now - 2 * 10**9), now=now)
+    own_fleet.publish(POLICY.replace('owner = "drone-1"', 'owner = "drone-1"\nmax_age = 1.0'))
+    opener.open(sealer.seal(b"x", now=now), now=now)
+    assert reason(opener.open, sealer.seal(b"x", now=now - 2 * 10**9), now=now) == Reason.TOO_OLD
+
+
 def test_keys_change_while_messages_flow(own_fleet: Fleet) -> None:
     sealer, opener = own_fleet.pair("camera", "drone-1", "server")
     (first,) = receive(opener, sealer.seal(b"x"))

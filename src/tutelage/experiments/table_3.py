@@ -251,9 +251,12 @@ def _summary(result: dict[str, Any]) -> str:
 
 def table(name: str, results: list[dict[str, Any]]) -> str:
     """Published and ours side by side, as Markdown."""
-    seeds, steps = {r["seed"] for r in results}, int(results[0]["metrics"]["t"])
+    count = {algorithm: sum(r["algorithm"] == algorithm for r in results) for algorithm in SETTINGS[name].published}
+    counts = sorted(set(count.values()))
+    seeds = f"{counts[0]} seeds" if len(counts) == 1 else f"seeds: {', '.join(f'{a} {n}' for a, n in count.items())}"
+    steps = int(results[0]["metrics"]["t"])
     lines = [
-        f"{name.replace('t', 'T', 1).replace('-', ' ')}, {_scale(name, results)}: {steps:,} timesteps, {len(seeds)} seeds. "
+        f"{name.replace('t', 'T', 1).replace('-', ' ')}, {_scale(name, results)}: {steps:,} timesteps, {seeds}. "
         "Mean ± standard deviation over episodes; our successes are the mean over seeds ± 95 % interval.",
         "",
         "| Algorithm | | Ints | Acts (H) | Acts (R) | Alone ↑ | Ints, execution | Acts (H) | Acts (R) | With help ↑ |",

@@ -93,7 +93,7 @@ class Confirmation:
 
         Raises:
             Refused: UNCONFIRMED (provisional): earlier messages of the stream were not confirmed in time. FORGED: an anchor
-                says that this is another message.
+                says that this is another message. REPLAYED: it is held already.
         """
         proof = hashlib.sha256(statement).digest()
         known = (self._confirmed.get(stream) or _NOTHING).get(first)
@@ -109,6 +109,8 @@ class Confirmation:
             while len(waiting) > MAX_HELD:
                 waiting.popitem(last=False)
             return messages
+        if (stream, first, proof) in self._held:
+            raise Refused(Reason.REPLAYED, f"message {first} is held already, until its sender confirms it")
         self._held[stream, first, proof] = messages, size
         self._held_bytes += size
         while len(self._held) > MAX_HELD or self._held_bytes > MAX_HELD_BYTES:

@@ -8,7 +8,7 @@ bundle          what the authority gave, sealed to this node; all that follows i
 leaf.pem        certificate and its issuer's, for TLS
 root.pem        the root that this node believes
 deny            the newest deny list
-keys/           of topics, by alias, sealed to this node
+keys/           of topics, a file an alias, sealed to this node
 """
 
 from __future__ import annotations

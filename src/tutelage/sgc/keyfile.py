@@ -34,8 +34,8 @@ class TopicKeys:
         self.entry = entry
         self.exchange = Exchange(entry)
         self.epochs = Epochs()
-        self.path = home.path / "keys" / entry.rule.alias
-        self.lock = Lock(self.path.with_suffix(".lock"))
+        self.path = home.path / "keys" / f"{entry.rule.alias}.keys"
+        self.lock = Lock(self.path.parent / ".lock")
         self.owner: Member | None = None
         self._owner = ""
         self._sealing = home.sealing_key
@@ -51,11 +51,22 @@ class TopicKeys:
 
     def learn(self, epochs: list[Epoch], owner: Member) -> bool:
         """Keep what a grant brought; True if it was news."""
-        new = self.epochs.add(epochs)
-        self.owner, known, self._owner = owner, self._owner, owner.pseudonym
-        if new or known != self._owner:
-            self.save()
-        return new
+        with self.lock:
+            self.refresh()
+            new = self.epochs.add(epochs)
+            self.owner, known, self._owner = owner, self._owner, owner.pseudonym
+            if new or known != self._owner:
+                self.save()
+            return new
+
+    def drop(self, now: float) -> bool:
+        """Forget keys that are over; True if there were any."""
+        with self.lock:
+            self.refresh()
+            dropped = self.epochs.drop(now)
+            if dropped:
+                self.save()
+            return dropped
 
     def owner_revoked(self, denied: frozenset[str]) -> bool:
         """Is the owner that granted the keys one of these pseudonyms?"""

@@ -218,9 +218,7 @@ class Keyring:
                 self.version += 1
             for alias in self.home.access.topics:
                 keys = self._keys(alias, now)
-                keys.refresh()
-                if keys.epochs.drop(now):
-                    keys.save()
+                if keys.refresh() | keys.drop(now):
                     self.version += 1
                 if not self.owns(alias):
                     continue

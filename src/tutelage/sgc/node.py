@@ -24,16 +24,17 @@ from tutelage.sgc import health, lanes
 from tutelage.sgc.access import Access, Entry, Kind, Lane
 from tutelage.sgc.errors import NotAllowed
 from tutelage.sgc.home import Home
+from tutelage.sgc.key_exchange import KeyExchange
 from tutelage.sgc.keyring import Keyring
 from tutelage.sgc.messages import Message
 from tutelage.sgc.presence import Peer, Presence
 from tutelage.sgc.publisher import Publisher
-from tutelage.sgc.reasons import Reason, Refusals, Refused
+from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.renewal import Renewer
 from tutelage.sgc.sealing import Opener, Sealer
 from tutelage.sgc.service import Requester, Server
 from tutelage.sgc.subscription import Subscription
-from tutelage.sgc.transport.base import Handle, NoReply, Transport
+from tutelage.sgc.transport.base import Handle, Transport
 from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
@@ -41,11 +42,6 @@ log = logging.getLogger(__name__)
 TEND = 0.5
 """Seconds between two looks at keys and files."""
 
-ASK_TIMEOUT = 1.0
-"""Seconds to wait for the owner of a topic to send its key."""
-
-ASK_AGAIN = 0.1, 2.0
-"""Seconds until a key that did not come is asked for again: first, and at most."""
 
 GOSSIP = 10.0
 """Seconds after which the deny list is passed on again."""
@@ -72,18 +68,14 @@ class Node:
         self._pool = Workers("sgc-ask")
         self._wake = threading.Event()
         self._closed = threading.Event()
-        self._asked: dict[str, tuple[float, float]] = {}  # alias -> when to ask again, and the pause after that
-        self._certificate = home.expires
+        self._certificate, self._version = home.expires, home.version
         self._gossiped = float("-inf")
-        self._presence: Presence | None = None
-        for alias, entry in self.access.topics.items():
-            self._handles += self._exchange_keys(alias, entry)
+        self._joined: dict[str, tuple[Entry, list[Handle]]] = {}
+        self._keys = KeyExchange(self.keyring, transport, self._pool, self.refusals, self._wake.set, self._key_came)
+        self.presence = Presence(self.keyring, home.pseudonym, transport, self._wake.set, self._pool)
         self._deny_key = lanes.key(self.access.control, lanes.DENY)
         self._handles.append(transport.subscribe(self._deny_key, self._on_deny))
-        self._presence = Presence(self.keyring, self.access.topics, home.pseudonym, transport, self._need_key, self._pool)
-        for alias, entry in self.access.topics.items():
-            if not self.keyring.owns(alias):
-                self._presence.directory.subscribe(entry.name, partial(self._somebody_came, alias))
+        self._follow_policy()
         self._thread = threading.Thread(target=self._tend, name="sgc-tend", daemon=True)
         self._thread.start()
         self._renewer = Renewer(home, transport.request)
@@ -142,7 +134,7 @@ class Node:
             publisher = self._publishers.get(alias)
             if publisher is None or publisher.closed:
                 sealer = Sealer(self.keyring, alias)
-                publisher = self._publishers[alias] = Publisher(alias, entry, sealer, self.transport, self._need_key)
+                publisher = self._publishers[alias] = Publisher(alias, entry, sealer, self.transport, self._wake.set)
             return publisher
 
     def subscribe(
@@ -165,7 +157,7 @@ class Node:
         """
         entry = self._entry(alias, Kind.STREAM)
         opener = Opener(self.keyring, alias, provisional=provisional)
-        subscription = Subscription(alias, entry, opener, self.transport, self._need_key, self._pool, on_message, queue)
+        subscription = Subscription(alias, entry, opener, self.transport, self._wake.set, self._pool, on_message, queue)
         with self._lock:
             self._subscriptions = [each for each in self._subscriptions if not each.closed] + [subscription]
         return subscription
@@ -184,7 +176,7 @@ class Node:
             if requester is None:
                 sealer, opener = Sealer(self.keyring, alias, Lane.REQUEST), Opener(self.keyring, alias, Lane.REPLY)
                 key = lanes.key(entry.name, lanes.CALL)
-                requester = Requester(alias, key, sealer, opener, self.transport, self._need_key)
+                requester = Requester(alias, key, sealer, opener, self.transport, self._wake.set)
                 self._requesters[alias] = requester
         return requester.request(payload, timeout).payload
 
@@ -206,7 +198,7 @@ class Node:
 
         timeout: seconds to wait for those met for the first time.
         """
-        return self._presence.peers(timeout) if self._presence else []
+        return self.presence.peers(timeout)
 
     def ping(self, name: str, timeout: float = 2.0) -> float:
         """The round trip to another node and back, sealed and signed both ways, in seconds.
@@ -214,9 +206,7 @@ class Node:
         Raises:
             NoReply: no such node is present on a topic of ours, or it does not answer in time.
         """
-        if self._presence is None:
-            raise NoReply(f"{self.name} is closed")
-        return self._presence.ping(name, timeout)
+        return self.presence.ping(name, timeout)
 
     def close(self) -> None:
         """Close publishers, subscriptions, services and, if `open` made it, the transport."""
@@ -231,11 +221,13 @@ class Node:
             subscription.close()
         for handle in self._handles:
             handle.close()
-        if self._presence is not None:
-            self._presence.close()
+        for _, joined in self._joined.values():
+            for handle in joined:
+                handle.close()
+        self.presence.close()
         self._pool.close()
         if threading.current_thread() is not self._thread:
-            self._thread.join(2 * ASK_TIMEOUT)
+            self._thread.join(2.0)
         if self._own_transport:
             self.transport.close()
 
@@ -276,41 +268,31 @@ class Node:
             raise NotAllowed(f"{alias} is a {entry.rule.kind}: {self.name} can only {verbs} there")
         return entry
 
-    # -- keys --------------------------------------------------------------------------------------------------------------
+    # -- what a node owes to others and to itself --------------------------------------------------------------------------
 
-    def _need_key(self) -> None:
-        """Look for keys at once, rather than at the next turn."""
-        self._wake.set()
+    def _join(self, alias: str, entry: Entry) -> None:
+        """Take part in a topic of the policy."""
+        handles = [self._keys.join(alias, entry)]
+        handles += self.presence.join(alias, entry)
+        if not self.keyring.owns(alias):
+            self.presence.directory.subscribe(entry.name, partial(self._keys.somebody_came, alias))
+        self._joined[alias] = (entry, handles)
 
-    def _exchange_keys(self, alias: str, entry: Entry) -> list[Handle]:
-        """Answer requests for the keys of own topics; take the keys that others hand out."""
-        if self.keyring.owns(alias):
-            return [self.transport.serve(lanes.key(entry.name, lanes.KEYS), lambda asked: self._answer(alias, asked))]
-        return [self.transport.subscribe(lanes.key(entry.name, lanes.GRANTS), lambda grant: self._accept(alias, grant))]
-
-    def _answer(self, alias: str, request: bytes) -> bytes | None:
-        try:
-            return self.keyring.answer(alias, request)
-        except Refused as refused:
-            self.refusals.add(refused.reason)
-        except TutelageError as error:
-            log.warning("a key of %s could not be handed out: %s", alias, error)
-        return None
-
-    def _accept(self, alias: str, grant: bytes) -> None:
-        before = self.keyring.version
-        try:
-            self.keyring.accept(alias, grant)
-        except Refused as refused:
-            if refused.reason != Reason.NOT_FOR_US:
-                self.refusals.add(refused.reason)
-            return
-        if self.keyring.version != before:
-            self._key_came(alias)
+    def _follow_policy(self) -> None:
+        """Topics may have come, gone, or changed their owner or name."""
+        topics = self.access.topics
+        for alias, (entry, handles) in list(self._joined.items()):
+            if topics.get(alias) != entry:
+                for handle in handles:
+                    handle.close()
+                self.presence.leave(alias)
+                del self._joined[alias]
+        for alias, entry in topics.items():
+            if alias not in self._joined:
+                self._join(alias, entry)
 
     def _key_came(self, alias: str) -> None:
         with self._lock:
-            self._asked.pop(alias, None)
             publisher = self._publishers.get(alias)
             waiting = [each for each in self._subscriptions if each.alias == alias]
         if publisher is not None:
@@ -318,51 +300,16 @@ class Node:
         for subscription in waiting:
             subscription.retry()
 
-    def _fetch_keys(self) -> float:
-        """Ask owners for the keys that we lack. Returns the seconds until the next attempt."""
-        now = time.monotonic()
-        for alias in self.keyring.wanted():
-            with self._lock:
-                at, pause = self._asked.get(alias, (now, ASK_AGAIN[0]))
-                if at > now:
-                    continue
-                self._asked[alias] = (now + ASK_TIMEOUT + pause, min(2 * pause, ASK_AGAIN[1]))
-            self._pool.submit(self._ask, alias)
-        with self._lock:
-            return min((at - now for at, _ in self._asked.values()), default=TEND)
-
-    def _somebody_came(self, alias: str, who: str) -> None:
-        """It may be the owner of a topic whose key we lack."""
-        with self._lock:
-            waiting = self._asked.pop(alias, None)
-        if waiting is not None:
-            self._wake.set()
-
-    def _ask(self, alias: str) -> None:
-        try:
-            key = lanes.key(self.access.entry(alias).name, lanes.KEYS)
-            self._accept(alias, self.transport.request(key, self.keyring.ask(alias), ASK_TIMEOUT))
-        except NoReply:
-            with self._lock:
-                if alias in self._asked:
-                    at, pause = self._asked[alias]
-                    self._asked[alias] = (min(at, time.monotonic() + pause), pause)
-            self._wake.set()
-        except TutelageError as error:
-            log.warning("no key of %s: %s", alias, error)
-
-    # -- what a node owes --------------------------------------------------------------------------------------------------
-
     def _tend(self) -> None:
         turn = 0.0
         while not self._closed.is_set():
             self._wake.clear()
             try:
-                pause = self._fetch_keys()
+                pause = self._keys.fetch()
                 if time.monotonic() >= turn:
                     turn = time.monotonic() + TEND
                     self._follow_files()
-                    self._hand_out_keys()
+                    self._keys.hand_out()
                     self._gossip()
             except TutelageError as error:
                 log.warning("%s: %s", self.name, error)
@@ -374,17 +321,15 @@ class Node:
 
     def _follow_files(self) -> None:
         """Certificate, policy and deny list may have changed on disk."""
-        if not self.home.refresh():
+        self.home.refresh()
+        if self.home.version == self._version:
             return
+        self._version = self.home.version
         if self.home.expires != self._certificate:
             self._certificate = self.home.expires
             self.transport.renew()
             log.info("%s goes on with its new certificate", self.name)
-
-    def _hand_out_keys(self) -> None:
-        for push in self.keyring.tend():
-            self.transport.publish(lanes.key(self.access.entry(push.alias).name, lanes.GRANTS), push.grant)
-            self._key_came(push.alias)
+        self._follow_policy()
 
     def _gossip(self) -> None:
         """Pass on the deny list, so that it reaches those who were away."""

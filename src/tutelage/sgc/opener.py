@@ -296,6 +296,7 @@ class Opener:
                 self._entry = self._home.access.check(self.alias, self.lane, sends=False)
                 if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
                     raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
+                self._replay.set_max_age(self._entry.rule.max_age)
             self._versions, self._looked = versions, now
             self._look_count += 1
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from tutelage.errors import TutelageError
@@ -41,30 +41,38 @@ class Presence:
     """This node's own tokens and echoes, and those of others on the topics that it shares with them."""
 
     def __init__(
-        self,
-        keyring: Keyring,
-        topics: Mapping[str, Entry],
-        pseudonym: str,
-        transport: Transport,
-        need_key: Callable[[], None],
-        pool: Workers,
+        self, keyring: Keyring, pseudonym: str, transport: Transport, need_key: Callable[[], None], pool: Workers
     ) -> None:
+        """
+        Args:
+            need_key: called when the key of a topic is missing.
+            pool: where pings wait for their answers.
+        """
         self.directory = Directory(transport)
-        self._topics = topics
-        self._pseudonym = pseudonym
-        self._pool = pool
+        self._keyring, self._pseudonym, self._transport = keyring, pseudonym, transport
+        self._need_key, self._pool = need_key, pool
         self._lock = threading.Lock()
+        self._topics: dict[str, Entry] = {}
         self._known: dict[str, tuple[str, float]] = {}  # pseudonym -> name, round trip in seconds
-        self._handles: list[Handle] = []
         self._requesters: dict[tuple[str, str], Requester] = {}
-        self._keyring, self._transport, self._need_key = keyring, transport, need_key
-        for alias, entry in topics.items():
-            server = Server(alias, *self._ends(alias), lambda asked: asked.payload)
-            self._handles += [
-                transport.serve(lanes.key(entry.name, lanes.ECHO, pseudonym), server.answer),
-                self.directory.publish(entry.name, pseudonym),
-            ]
-            self.directory.subscribe(entry.name)
+
+    def join(self, alias: str, entry: Entry) -> list[Handle]:
+        """Be present on a topic, answer pings there, and see who else does, until the handles are closed."""
+        server = Server(alias, *self._ends(alias), lambda asked: asked.payload)
+        handles = [
+            self._transport.serve(lanes.key(entry.name, lanes.ECHO, self._pseudonym), server.answer),
+            self.directory.publish(entry.name, self._pseudonym),
+        ]
+        self.directory.subscribe(entry.name)
+        with self._lock:
+            self._topics[alias] = entry
+        return handles
+
+    def leave(self, alias: str) -> None:
+        """Do not look for others on a topic any more."""
+        with self._lock:
+            self._topics.pop(alias, None)
+            self._requesters = {key: each for key, each in self._requesters.items() if key[0] != alias}
 
     def peers(self, timeout: float) -> list[Peer]:
         """Who is there and answers; those met for the first time are asked who they are, for at most `timeout` seconds."""
@@ -99,9 +107,7 @@ class Presence:
             time.sleep(0.05)
 
     def close(self) -> None:
-        """Leave."""
-        for handle in self._handles:
-            handle.close()
+        """Look for nobody any more."""
         self.directory.close()
 
     def _ends(self, alias: str) -> tuple[Sealer, Opener]:
@@ -110,7 +116,9 @@ class Presence:
     def _present(self) -> dict[str, list[str]]:
         """Aliases by pseudonym."""
         present: dict[str, list[str]] = {}
-        for alias, entry in self._topics.items():
+        with self._lock:
+            topics = dict(self._topics)
+        for alias, entry in topics.items():
             for who in self.directory.present(entry.name) - {self._pseudonym}:
                 present.setdefault(who, []).append(alias)
         return present

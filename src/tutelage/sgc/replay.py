@@ -81,10 +81,14 @@ class Replay:
             started: when the receiver began, nanoseconds since 1970: what was sent long before may be a repetition of what
                 an earlier start of the receiver had.
         """
-        self._max_age = None if max_age is None else round(max_age * 1e9)
+        self.set_max_age(max_age)
         self._floor = started - TOLERANCE_NS
         self._senders: OrderedDict[bytes, _Sender] = OrderedDict()
         self._lock = threading.Lock()
+
+    def set_max_age(self, max_age: float | None) -> None:
+        """The policy may change it. Seconds."""
+        self._max_age = None if max_age is None else round(max_age * 1e9)
 
     def check(self, sender: bytes, salt: bytes, first: int, sent: int, now: int) -> None:
         """Could a message be taken, as far as its header says? Remembers nothing, so it may be asked before the message is

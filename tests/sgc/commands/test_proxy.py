@@ -9,7 +9,7 @@ import sys
 import urllib.request
 
 import pytest
-from sgc.fleets import free_port, make_fleet, service, topic
+from sgc.fleets import Fleet, free_port, service, topic
 from sgc.proxies.company import stay_on_loopback
 from sgc.proxies.ros_ends import ADD, RosNode, taken, until
 from websockets.sync.client import connect
@@ -38,11 +38,11 @@ domain = {domain}
 
 @pytest.fixture
 def fleet(tmp_path):
-    fleet = make_fleet(tmp_path, POLICY, ["robot", "web"], ["router"])
+    fleet = Fleet(tmp_path, POLICY, ["robot", "web"], ["router"])
     address = f"tls/127.0.0.1:{free_port()}"
     for name in ("robot", "web"):
-        (fleet.homes[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
-    with Router(fleet.homes["router"], RouterConfig.of([address])):
+        (fleet[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
+    with Router(fleet["router"], RouterConfig.of([address])):
         yield fleet
 
 
@@ -59,8 +59,8 @@ def test_a_page_talks_to_a_ros_domain_through_two_proxies_and_a_router(fleet, tm
     domain, health = 79, free_port()
     routes = tmp_path / "routes.toml"
     routes.write_text(ROUTES.format(domain=domain))
-    ros2, said = start("ros2", fleet.homes["robot"].path, routes, "--health", f"127.0.0.1:{health}")
-    web, said_web = start("rosbridge", fleet.homes["web"].path, "--listen", "127.0.0.1:0")
+    ros2, said = start("ros2", fleet["robot"].path, routes, "--health", f"127.0.0.1:{health}")
+    web, said_web = start("rosbridge", fleet["web"].path, "--listen", "127.0.0.1:0")
     try:
         assert said == f"robot: 1 topic and 1 service between DDS domain {domain} and the fleet; Ctrl-C ends it"
         assert said_web.startswith("web: 1 topic and 1 service at ws://127.0.0.1:")

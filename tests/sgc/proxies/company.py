@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from sgc.members import Fleet
+from sgc.fleets import Fleet
 
 from tutelage.sgc.node import Node
 from tutelage.sgc.transport.memory import MemoryTransport, Network
@@ -36,7 +36,7 @@ class Company:
 
     def __getitem__(self, name: str) -> Node:
         if name not in self.nodes:
-            self.nodes[name] = Node.open(self.fleet.homes[name], MemoryTransport(self.network))
+            self.nodes[name] = Node.open(self.fleet[name], MemoryTransport(self.network))
         return self.nodes[name]
 
     def __iter__(self) -> Iterator[Node]:

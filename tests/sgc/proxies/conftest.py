@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from sgc.fleets import make_fleet
+from sgc.fleets import Fleet
 from sgc.proxies.company import Company, stay_on_loopback
 
 stay_on_loopback()
@@ -26,7 +26,7 @@ def company(tmp_path: Path) -> Iterator[Callable[..., Company]]:
     made: list[Company] = []
 
     def make(policy: str, *names: str) -> Company:
-        made.append(Company(make_fleet(tmp_path / f"fleet{len(made)}", policy, names)))
+        made.append(Company(Fleet(tmp_path / f"fleet{len(made)}", policy, names)))
         return made[-1]
 
     yield make

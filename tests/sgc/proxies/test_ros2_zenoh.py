@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from sgc.fleets import free_port, make_fleet, service, topic
+from sgc.fleets import Fleet, free_port, service, topic
 from sgc.proxies.ros_ends import ADD, STRING, AddClient, AddServer, RosNode, taken, until
 from sgc.proxies.test_ros2 import DEEP
 
@@ -18,14 +18,14 @@ POLICY = topic("chat", ["robot", "server"], ["robot", "server"]) + service("add"
 @pytest.fixture
 def nodes(tmp_path):
     """Robot and server, each dialling out to a router that can read nothing."""
-    fleet = make_fleet(tmp_path, POLICY, ["robot", "server"], ["router"])
+    fleet = Fleet(tmp_path, POLICY, ["robot", "server"], ["router"])
     address = f"tls/127.0.0.1:{free_port()}"
     for name in ("robot", "server"):
-        (fleet.homes[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
+        (fleet[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
     with (
-        Router(fleet.homes["router"], RouterConfig.of([address])),
-        Node.open(fleet.homes["robot"].path) as robot,
-        Node.open(fleet.homes["server"].path) as server,
+        Router(fleet["router"], RouterConfig.of([address])),
+        Node.open(fleet["robot"].path) as robot,
+        Node.open(fleet["server"].path) as server,
     ):
         assert until(lambda: robot.connected and server.connected)
         yield robot, server

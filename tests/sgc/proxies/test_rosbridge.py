@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from sgc.fleets import make_fleet, service, topic
+from sgc.fleets import Fleet, service, topic
 from sgc.proxies.company import Company
 from sgc.proxies.ros_ends import ADD, STRING, cdr, until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -78,7 +78,7 @@ def bridge(robot_and_bridge):
 @pytest.fixture(scope="module")
 def patient_bridge(tmp_path_factory):
     """One for the tests that change nothing."""
-    nodes = Company(make_fleet(tmp_path_factory.mktemp("fleet"), POLICY, ["robot", "web"]))
+    nodes = Company(Fleet(tmp_path_factory.mktemp("fleet"), POLICY, ["robot", "web"]))
     with Bridge(nodes["web"], all_routes(nodes["web"].access), TYPES, port=0) as bridge:
         yield bridge
     nodes.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from sgc.fleets import make_fleet, service, topic
+from sgc.fleets import Fleet, service, topic
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.access import Access
@@ -27,12 +27,12 @@ POLICY = (
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory):
-    return make_fleet(tmp_path_factory.mktemp("fleet"), POLICY, ["robot", "server"])
+    return Fleet(tmp_path_factory.mktemp("fleet"), POLICY, ["robot", "server"])
 
 
 @pytest.fixture
 def robot(fleet) -> Access:
-    return fleet.homes["robot"].access
+    return fleet["robot"].access
 
 
 def routes(access, **content):
@@ -51,7 +51,7 @@ def test_a_service_says_on_which_side_its_server_is(fleet, robot):
     entry = {"alias": "grasp", "direction": "out", "timeout": 2}
     assert routes(robot, service=[entry]).services == (ServiceRoute("grasp", "/grasp", "std_srvs/srv/Trigger", True, 2),)
     entry["direction"] = "in"
-    assert not routes(fleet.homes["server"].access, service=[entry]).services[0].outward
+    assert not routes(fleet["server"].access, service=[entry]).services[0].outward
 
 
 def test_an_action_is_three_services_and_two_topics(robot):
@@ -80,7 +80,7 @@ def test_several_topics_of_the_fleet_may_meet_on_one_name(robot):
 
 
 def test_all_of_a_nodes_topics_and_services_without_a_file_but_for_those_that_ros_cannot_name(fleet):
-    made = all_routes(fleet.homes["server"].access)
+    made = all_routes(fleet["server"].access)
     assert {(route.alias, route.outward, route.inward) for route in made.topics} == {
         ("camera", False, True),
         ("chat", True, True),

@@ -65,7 +65,8 @@ def top(
         looks, before = 0, time.monotonic()
         while not stop.wait(interval) and (looks := looks + 1):
             now = time.monotonic()
-            page = Group(_nodes(node), _topics(subscriptions, heard, now - before))
+            state = "connected" if node.connected else "not connected to a router"
+            page = Group(f"{node.name}: {state}", _nodes(node), _topics(subscriptions, heard, now - before))
             before = now
             if live is not None:
                 live.update(page, refresh=True)
@@ -86,8 +87,7 @@ def _count(heard: dict[tuple[str, str], Heard]) -> Callable[[Message], None]:
 
 
 def _nodes(node: Node) -> Table:
-    state = "connected" if node.connected else "not connected to a router"
-    table = Table(box=None, header_style="bold", title=f"{node.name}: {state}", title_justify="left")
+    table = Table(box=None, header_style="bold", pad_edge=False)
     for head in ("node", "round trip", "shared topics"):
         table.add_column(head, justify="right" if head == "round trip" else "left")
     for peer in node.peers(0.3):
@@ -96,7 +96,7 @@ def _nodes(node: Node) -> Table:
 
 
 def _topics(subscriptions: list[Subscription], heard: dict[tuple[str, str], Heard], seconds: float) -> Table:
-    table = Table(box=None, header_style="bold")
+    table = Table(box=None, header_style="bold", pad_edge=False)
     for head in ("topic", "sender", "messages/s", "KB/s", "latency", "lost", "repaired", "refused"):
         table.add_column(head, justify="left" if head in ("topic", "sender") else "right")
     for subscription in subscriptions:
