@@ -28,7 +28,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^<!-- run(?P<output>: output)? -->\n```(?P<kind>\w+)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
 OTHERWISE = "prints something else; run: python tests/run_examples.py --write"
-LIMIT = 600  # seconds; a hanging command must not hang the build
+LIMIT = 300  # seconds; a hanging command must not hang the build
 
 
 @dataclass

@@ -61,6 +61,18 @@ def test_from_nothing_to_the_first_message(keys: Keys) -> None:
     assert [str(router) for router in NetworkConfig.load(Path("drone")).routers] == ["tls/192.0.2.7:7447"]
 
 
+def test_a_router_named_before_the_nodes_lets_them_through(keys: Keys) -> None:
+    keys("init fleet --fleet acme")
+    keys("init hub --router hub --address 127.0.0.1")
+    for name in ("drone-1", "server", "late"):
+        keys(f"init {name} --node {name}")
+    assert "must hear" not in keys("issue fleet hub drone-1 server --policy")
+    assert Home.open(Path("hub")).access.members == {Home.open(Path(name)).pseudonym for name in ("drone-1", "server")}
+    assert "hub: the router must hear of them: tutelage keys renew HOME --bundle fleet/outbox/hub.bundle" in keys("issue fleet late")
+    keys("renew hub --bundle fleet/outbox/hub.bundle")
+    assert Home.open(Path("late")).pseudonym in Home.open(Path("hub")).access.members
+
+
 def test_people_compare_fingerprints(keys: Keys) -> None:
     made = keys("init drone --node drone-1").splitlines()[-1].split()[-1]
     assert made in keys("show drone/request.pem")

@@ -130,6 +130,11 @@ class Authority:
         """Members, revoked pseudonyms, serials. To be read only."""
         return self._roster
 
+    @property
+    def routers(self) -> list[str]:
+        """Names of the routers that are members."""
+        return [name for name, record in self._roster.members.items() if record.keys.role == Role.ROUTER]
+
     def refresh(self) -> None:
         """Read again what another process changed."""
         with self._lock:

@@ -88,16 +88,21 @@ def issue(
     if policy:
         bundles = fleet.publish(hours=hours)
         _say(f"policy {fleet.roster.serial} of {fleet.fleet} is signed; {len(bundles)} bundles in {authority / 'outbox'}")
+    names = []
     for request in requests:
         pem = _read(request / "request.pem" if request.is_dir() else request)
-        name = _name_of(pem)
-        bundle = fleet.issue(pem, hours=hours)
+        names.append(_name_of(pem))
+        fleet.issue(pem, hours=hours)
+    for request, name in zip(requests, names, strict=True):  # only now: bundles of routers name all new nodes
+        bundle = authority / "outbox" / f"{name}.bundle"
         if request.is_dir():
-            _home(request).accept(bundle)
+            _home(request).accept(bundle.read_bytes())
             _say(f"{name}: certificate for {hours:g} hours, installed in {request}")
         else:
-            _say(f"{name}: certificate for {hours:g} hours in {authority / 'outbox' / f'{name}.bundle'}; on the node:")
+            _say(f"{name}: certificate for {hours:g} hours in {bundle}; on the node:")
             _say(f"    tutelage keys renew HOME --bundle {name}.bundle")
+    for name in sorted(set(fleet.routers) - set(names)) if requests else ():
+        _say(f"{name}: the router must hear of them: tutelage keys renew HOME --bundle {authority / 'outbox' / name}.bundle")
 
 
 def renew(
