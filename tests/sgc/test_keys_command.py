@@ -68,7 +68,9 @@ def test_a_router_named_before_the_nodes_lets_them_through(keys: Keys) -> None:
         keys(f"init {name} --node {name}")
     assert "must hear" not in keys("issue fleet hub drone-1 server --policy")
     assert Home.open(Path("hub")).access.members == {Home.open(Path(name)).pseudonym for name in ("drone-1", "server")}
-    assert "hub: the router must hear of them: tutelage keys renew HOME --bundle fleet/outbox/hub.bundle" in keys("issue fleet late")
+    assert "hub: the router must hear of them: tutelage keys renew HOME --bundle fleet/outbox/hub.bundle" in keys(
+        "issue fleet late"
+    )
     keys("renew hub --bundle fleet/outbox/hub.bundle")
     assert Home.open(Path("late")).pseudonym in Home.open(Path("hub")).access.members
 
