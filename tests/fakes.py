@@ -34,6 +34,7 @@ class PointFleet(Fleet):
         num_envs: N.
         bound, goal, horizon, drift, noise, start: as above; start: half-width of the initial positions.
         falls, successes: robots that violate / succeed in the step of that number, whatever their position.
+        away: robots that cannot be reached after the step of that number.
         can_pause: whether `active` is obeyed.
         log: where to note calls.
     """
@@ -50,12 +51,14 @@ class PointFleet(Fleet):
         start: float = 0.0,
         falls: Script | None = None,
         successes: Script | None = None,
+        away: Script | None = None,
         can_pause: bool = True,
         log: list[Any] | None = None,
     ) -> None:
         self.num_envs, self.bound, self.goal, self.horizon = num_envs, bound, goal, horizon
         self.drift, self.noise, self.start = drift, noise, start
         self.falls, self.successes = dict(falls or {}), dict(successes or {})
+        self.away = dict(away or {})
         self.can_pause, self.log = can_pause, [] if log is None else log
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), dtype=np.float64)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
@@ -99,8 +102,10 @@ class PointFleet(Fleet):
         self.violation = self.violation | (moving & ((np.abs(at) > self.bound) | self._scripted(self.falls)))
         success = moving & (((at > self.goal) & ~self.violation) | self._scripted(self.successes))
         truncated = moving & (self.obs[:, ELAPSED] >= self.horizon) & ~self.violation
-        self.t += 1
         info = {"violation": self.violation.copy(), "success": success}
+        if self.away:
+            info["online"] = ~self._scripted(self.away)
+        self.t += 1
         return self.obs, np.where(moving, 1.0, 0.0), self.violation.copy(), truncated, info
 
     def _scripted(self, script: dict[int, Sequence[int]]) -> Any:

@@ -15,7 +15,6 @@ import numpy as np
 from tutelage.errors import MissingExtraError, RunFolderError, TutelageError
 from tutelage.fleet.events import Events
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.modes import MOVING, Mode
 from tutelage.fleet.step import Step
 from tutelage.fleet.tally import Tally
 from tutelage.store import write_atomic
@@ -129,8 +128,7 @@ class EpisodeFrames:
 
     def add(self, step: Step) -> None:
         """Keep the frames of a timestep that are asked for."""
-        moving = MOVING[step.mode]
-        human = step.mode == Mode.TELEOPERATED
+        moving, human = step.moved, step.taught
         keep = human if self._which == "human" else moving
         (robots,) = np.nonzero(keep)
         if robots.size:

@@ -23,6 +23,8 @@ class Fleet(VectorEnv[Any, Any, Any]):
     * `info` of `step` and `reset` holds, for every robot: `info["violation"]` (N,) bool, the constraint c(s) of
       section 5.3, and `info["success"]` (N,) bool, true only on the step that completes the task.
     * A robot that violated its constraint stands still, whatever its action, and stays in violation until it is reset.
+    * Where robots can be out of reach, `info["online"]` (N,) bool says which are not; without it all can be reached. The
+      observation of the others is the last one.
 
     An episode that ends without violation ends in `success`, in `truncated`, or in both.
 

@@ -65,7 +65,7 @@ class Loop:
     ) -> None:
         if len(team) > fleet.num_envs:
             raise ConfigError(f"{len(team)} humans for {fleet.num_envs} robots: use at most one human a robot (M <= N)")
-        if team.latency.any() and not fleet.can_pause:
+        if team.pauses and not fleet.can_pause:
             raise ConfigError("switching latency needs a fleet that can pause robots, and this one cannot")
         self.fleet, self.policy, self.priority, self.team = fleet, policy, priority, team
         self.allocator, self.execution = allocator or FleetDAgger(), execution or AsWanted()
@@ -90,7 +90,7 @@ class Loop:
         self.fresh = np.ones(n, dtype=bool)
         self.journal = Journal()
         self.obs, info = fleet.reset(seed=derive(seed, "fleet") % 2**32)
-        self.violation = info["violation"]
+        self.violation, self.online = info["violation"], info.get("online", np.ones(n, dtype=bool))
 
     def run(self, steps: int) -> None:
         """Run until timestep `steps`, telling the subscribers; an exception reaches them as the end of the run."""
@@ -108,18 +108,20 @@ class Loop:
     def step(self) -> Step:
         """One timestep of all robots."""
         self.journal.t, self.in_step = self.t, True
+        self._reach()
         view = self._observe()
         self._allocate(self.priority(view))
-        (actions, wanted), mode, human = self._act(view), self.mode.copy(), self.human_of
+        (actions, wanted, held), mode, human = self._act(view), self.mode.copy(), self.human_of
         losses: dict[str, float] = {}
 
-        self.fleet.step_async(actions, active=MOVING[mode])
+        self.fleet.step_async(actions, active=MOVING[mode] & ~held)
         if self.learner and self.overlap:
             losses = self.learner.update(self.t)
         next_obs, reward, _, truncated, info = self.fleet.step_wait()
 
         success = info["success"] & ~info["violation"]  # a robot that fell has not completed anything
-        self._finish(next_obs, info["violation"], success, truncated)
+        self.online = info.get("online", self.online)
+        self._finish(next_obs, info["violation"], success, truncated, held)
         step = Step(
             self.t, view.obs, view.actions, actions, wanted, mode, human, reward, next_obs,
             info["violation"], success, truncated, self.journal.take(), view.computed, losses,
@@ -142,6 +144,19 @@ class Loop:
 
     # -- the phases of a step, in their order -------------------------------------------------------------------
 
+    def _reach(self) -> None:
+        """Note who went out of reach, and who is back."""
+        away = self.mode == Mode.OFFLINE
+        if self.online.all() and not away.any():
+            return
+        (lost,) = np.nonzero(~self.online & ~away)
+        self._happen(Event.DISCONNECT, lost, self.human_of[lost])
+        back = self.online & away
+        self.fresh |= back
+        for event, mask in ((Event.CONNECT, ~self.violation), (Event.CONNECT_VIOLATED, self.violation)):
+            (robots,) = np.nonzero(back & mask)
+            self._happen(event, robots, np.full(len(robots), NOBODY))
+
     def _observe(self) -> FleetView:
         self._check(self.obs, "the observation")
         actions = np.asarray(self.policy.act(self.obs))
@@ -158,6 +173,9 @@ class Loop:
         if ranks.ndim != 2 or len(ranks) != self.fleet.num_envs or not ranks.shape[1]:
             raise ContractError(f"a priority must return ({self.fleet.num_envs}, K), got {ranks.shape}")
         before = self.robot_of
+        away = self.mode == Mode.OFFLINE
+        if away.any():
+            ranks = np.where(away[:, None], 0.0, ranks)  # nobody can help them
         # A reset that is over, or a fall while teleoperated, ended the intervention: its human is free again.
         ended = ~HELPED[self.mode[np.maximum(before, 0)]]
         self.robot_of = self.allocator(ranks, before, self.mode, self.age, self.rng)
@@ -175,34 +193,44 @@ class Loop:
 
         (busy,) = np.nonzero(self.robot_of != NOBODY)
         robots = self.robot_of[busy]
-        ready = (self.mode[robots] == Mode.SWITCHING) & (self.age[robots] >= self.team.latency[busy])
+        ready = (self.mode[robots] == Mode.SWITCHING) & self.team.ready(robots, busy, self.age[robots])
         broken = self.violation[robots]
         self._happen(Event.START_RESET, robots[ready & broken], busy[ready & broken])
         self._happen(Event.TAKE_OVER, robots[ready & ~broken], busy[ready & ~broken])
+        stuck = (self.mode[robots] == Mode.TELEOPERATED) & self.team.resets(robots, busy)
+        self._happen(Event.START_RESET, robots[stuck], busy[stuck])
 
-    def _act(self, view: FleetView) -> tuple[Array, Array]:
+    def _act(self, view: FleetView) -> tuple[Array, Array, Array]:
+        """What the robots are to do, what the humans want (N, A), and who is held because its human says nothing (N,)."""
         actions = view.actions.astype(np.float32, copy=True)
         wanted, self.discrepancy = np.full_like(actions, np.nan), np.full(len(actions), np.nan)
+        held = np.zeros(len(actions), dtype=bool)
         (robots,) = np.nonzero(self.mode == Mode.TELEOPERATED)
         if robots.size:
             low, high = self.fleet.action_low, self.fleet.action_high
             said = np.clip(self.team.act(view.obs[robots], robots, self.human_of[robots], actions.shape[1]), low, high)
+            silent = np.isnan(said).any(axis=1)
+            if silent.any():
+                held[robots[silent]] = True
+                robots, said = robots[~silent], said[~silent]
             wanted[robots] = self.human_action[robots] = said
             self.discrepancy[robots] = discrepancy(view.actions[robots], said, low, high)
             actions[robots] = np.clip(self.execution(self.t, said, view.actions[robots]), low, high)
-        return actions, wanted
+        return actions, wanted, held
 
-    def _finish(self, obs: Array, violation: Array, success: Array, truncated: Array) -> None:
+    def _finish(self, obs: Array, violation: Array, success: Array, truncated: Array, held: Array) -> None:
         """End of the step: note what happened, reset whom it is due, and look again."""
         self.age += 1
         human = self.human_of
-        moving = MOVING[self.mode]
+        moving = MOVING[self.mode] & ~held
         (fallen,) = np.nonzero(moving & violation)
         self._happen(Event.VIOLATE, fallen, human[fallen])
         for event, mask in ((Event.SUCCESS, success), (Event.TIMEOUT, truncated & ~success & ~violation)):
             (robots,) = np.nonzero(moving & mask)
             self._happen(event, robots, human[robots])
-        (righted,) = np.nonzero((self.mode == Mode.RESETTING) & (self.age >= self.allocator.t_reset))
+        (righted,) = np.nonzero(self.mode == Mode.RESETTING)
+        due = self.age[righted] >= self.allocator.t_reset
+        righted = righted[self.team.has_reset(righted, human[righted], due)]
         self._happen(Event.HARD_RESET, righted, human[righted])
 
         again = moving & (success | truncated) & ~violation
@@ -211,7 +239,7 @@ class Loop:
         if again.any():
             self._check(obs, "the last observation")  # the loop goes on from another one, but critics learn from it
             self.obs, info = self.fleet.reset(options={"reset_mask": again})
-            self.violation = info["violation"]
+            self.violation, self.online = info["violation"], info.get("online", self.online)
 
     def _check(self, values: Array, what: str) -> None:
         if len(values) != self.fleet.num_envs:
@@ -255,6 +283,7 @@ class Loop:
         set_rng_state(self.rng, state["rng"])
         for name in ("mode", "age", "robot_of", "human_action", "discrepancy", "fresh", "obs", "violation"):
             setattr(self, name, state[name].copy())
+        self.online = np.ones(self.fleet.num_envs, dtype=bool)  # until the fleet says otherwise
         self.fleet.load_state_dict(state["fleet"])
         self.team.load_state_dict(state["team"])
         self.priority.load_state_dict(state["priority"])

@@ -45,7 +45,9 @@ class Event(IntEnum):
     RELEASE = 3
     """The allocation takes the human away from a robot that can go on by itself."""
     DISCONNECT = 4
+    """The robot cannot be reached, or is stopped; whoever was with it is free."""
     CONNECT = 5
+    """It can be reached again and goes on by itself."""
     VIOLATE = 6
     """The step ended in c(s) = 1."""
     HARD_RESET = 7
@@ -56,6 +58,8 @@ class Event(IntEnum):
     """The horizon was reached without success; likewise."""
     ABANDON = 10
     """The allocation takes the human away from a robot in violation, before its hard reset is complete."""
+    CONNECT_VIOLATED = 11
+    """It can be reached again, and c(s) = 1."""
 
 
 END_OF_STEP = (Event.VIOLATE, Event.HARD_RESET, Event.SUCCESS, Event.TIMEOUT)
@@ -65,12 +69,13 @@ INVALID = -1
 A, S, T, V, R, O = Mode  # noqa: E741 - a table is read by its shape
 _ROWS: dict[Mode, dict[Event, Mode]] = {
     A: {Event.ASSIGN: S, Event.VIOLATE: V, Event.SUCCESS: A, Event.TIMEOUT: A, Event.DISCONNECT: O},
-    # Whether c(s) = 1 decides between TAKE_OVER and START_RESET, and between RELEASE and ABANDON: who has fallen never acts.
+    # Whether c(s) = 1 decides between TAKE_OVER and START_RESET, RELEASE and ABANDON, CONNECT and CONNECT_VIOLATED: who has
+    # fallen never acts. A person may also reset a robot that has not fallen and is stuck.
     S: {Event.TAKE_OVER: T, Event.START_RESET: R, Event.RELEASE: A, Event.ABANDON: V, Event.VIOLATE: V, Event.DISCONNECT: O},
-    T: {Event.RELEASE: A, Event.VIOLATE: V, Event.SUCCESS: T, Event.TIMEOUT: T, Event.DISCONNECT: O},
+    T: {Event.RELEASE: A, Event.START_RESET: R, Event.VIOLATE: V, Event.SUCCESS: T, Event.TIMEOUT: T, Event.DISCONNECT: O},
     V: {Event.ASSIGN: S, Event.DISCONNECT: O},
     R: {Event.HARD_RESET: A, Event.ABANDON: V, Event.DISCONNECT: O},
-    O: {Event.CONNECT: A},
+    O: {Event.CONNECT: A, Event.CONNECT_VIOLATED: V},
 }
 TABLE: NDArray[np.int8] = np.full((len(Mode), len(Event)), INVALID, dtype=np.int8)
 for _mode, _row in _ROWS.items():

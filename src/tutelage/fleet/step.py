@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.fleet.events import Events
+from tutelage.fleet.modes import MOVING, Mode
 
 if TYPE_CHECKING:
     from tutelage.fleet.loop import Loop
@@ -24,7 +27,8 @@ class Step:
         obs: (N, ...) what the robots saw.
         proposed: (N, A) what the policy would do.
         actions: (N, A) what was executed.
-        wanted: (N, A) what the humans wanted where teleoperated (executed unless an `Execution` changes it), else NaN.
+        wanted: (N, A) what the humans wanted where teleoperated (executed unless an `Execution` changes it), else NaN. NaN
+            also where a person gave no fresh command: that robot was held.
         mode: (N,) the `Mode` of each robot during the step.
         human: (N,) the human who helps each robot during the step, or -1.
         reward: (N,) float64.
@@ -52,6 +56,17 @@ class Step:
     events: Events
     signals: dict[str, Array] = field(default_factory=dict)
     losses: dict[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def moved(self) -> Array:
+        """(N,) bool, whose physics went on: autonomous robots, and teleoperated ones whose human commanded something."""
+        silent = (self.mode == Mode.TELEOPERATED) & np.isnan(self.wanted).any(axis=1)
+        return np.asarray(MOVING[self.mode] & ~silent)
+
+    @cached_property
+    def taught(self) -> Array:
+        """(N,) bool, the robots for which a human said what to do: `wanted` holds data to learn from."""
+        return np.asarray((self.mode == Mode.TELEOPERATED) & self.moved)
 
 
 class Subscriber(Protocol):

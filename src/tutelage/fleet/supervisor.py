@@ -98,6 +98,23 @@ class Team:
     def __len__(self) -> int:
         return len(self._kind)
 
+    @property
+    def pauses(self) -> bool:
+        """Whether robots stand still for this team: while a human is on the way, or says nothing."""
+        return bool(self.latency.any())
+
+    def ready(self, robots: Array, humans: Array, age: Array) -> Array:
+        """Whether the humans (n,) begin now with robots (n,) that have waited for them for age (n,) timesteps."""
+        return np.asarray(age >= self.latency[humans])
+
+    def resets(self, robots: Array, humans: Array) -> Array:
+        """Whether the humans (n,) now want a hard reset of robots (n,) that they teleoperate and that have not fallen."""
+        return np.zeros(len(robots), dtype=bool)
+
+    def has_reset(self, robots: Array, humans: Array, due: Array) -> Array:
+        """Whether the hard resets of robots (n,) by humans (n,) are complete, which `due` (n,) says by t_R."""
+        return due
+
     def act(self, obs: Array, robots: Array, humans: Array, width: int) -> Array:
         """Actions (n, width) of the humans (n,) who teleoperate the robots (n,) that show obs (n, ...).
 

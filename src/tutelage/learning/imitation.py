@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from tutelage.errors import ConfigError
-from tutelage.fleet.modes import MOVING, Mode
 from tutelage.fleet.step import Step
 from tutelage.learning.classifier import DiscrepancyClassifier
 from tutelage.learning.critic import Critic
@@ -104,12 +103,11 @@ class ImitationLearner:
 
     def record(self, step: Step) -> None:
         """Human actions into the dataset; every transition into the critics."""
-        human = step.mode == Mode.TELEOPERATED
-        if human.any():
-            self.dataset.add(step.obs[human], step.wanted[human])
-        self._episode_ended = bool((step.truncated | step.success | step.violation)[MOVING[step.mode]].any())
+        if step.taught.any():
+            self.dataset.add(step.obs[step.taught], step.wanted[step.taught])
+        self._episode_ended = bool((step.truncated | step.success | step.violation)[step.moved].any())
         if self.critics:
-            moved = MOVING[step.mode]
+            moved = step.moved
             obs, action, after = step.obs[moved], step.actions[moved], step.next_obs[moved]
             violation, success = step.violation[moved], step.success[moved]
             for name, critic in self.critics.items():
