@@ -28,7 +28,7 @@ _NAME = re.compile(r"[a-z][a-z0-9._-]{0,31}")
 _RESERVED = ("server", "nobody", "policy")
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS accounts (
-    name TEXT PRIMARY KEY, role TEXT NOT NULL, password TEXT NOT NULL, created REAL NOT NULL);
+    name TEXT PRIMARY KEY, role TEXT NOT NULL, password TEXT NOT NULL, created REAL NOT NULL, last_login REAL);
 CREATE TABLE IF NOT EXISTS sessions (
     token BLOB PRIMARY KEY, name TEXT NOT NULL REFERENCES accounts (name) ON DELETE CASCADE,
     created REAL NOT NULL, expires REAL NOT NULL);
@@ -56,11 +56,12 @@ class Role(IntEnum):
 
 @dataclass(frozen=True)
 class Account:
-    """One person."""
+    """One person. created, last_login: seconds since 1970."""
 
     name: str
     role: Role
     created: float
+    last_login: float | None = None
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,8 @@ class Accounts:
 
     def all(self) -> list[Account]:
         """Every account, by name."""
-        rows = self._query("SELECT name, role, created FROM accounts ORDER BY name")
-        return [Account(name, Role.of(role), created) for name, role, created in rows]
+        rows = self._query("SELECT name, role, created, last_login FROM accounts ORDER BY name")
+        return [Account(name, Role.of(role), *times) for name, role, *times in rows]
 
     def add(self, name: str, role: Role, password: str) -> Account:
         """A new account.
@@ -146,7 +147,7 @@ class Accounts:
         kept = self.passwords.hash(password, name)
         account = Account(name, role, self._clock())
         try:
-            self._query("INSERT INTO accounts VALUES (?, ?, ?, ?)", name, role.name.lower(), kept, account.created)
+            self._query("INSERT INTO accounts VALUES (?, ?, ?, ?, NULL)", name, role.name.lower(), kept, account.created)
         except sqlite3.IntegrityError:
             raise ConfigError(f"there is an account {name} already") from None
         return account
@@ -214,6 +215,7 @@ class Accounts:
             if replaces:
                 self.logout(replaces)
             self._query("DELETE FROM sessions WHERE expires <= ?", now)
+            self._query("UPDATE accounts SET last_login = ? WHERE name = ?", now, name)
             self._query("INSERT INTO sessions VALUES (?, ?, ?, ?)", _hash(token), name, now, now + SESSION_SECONDS)
         return token, Session(name, account.role, _hash(token), now + SESSION_SECONDS)
 

@@ -182,12 +182,7 @@ class Audit:
         Raises:
             RecordError: a row's arrays are damaged.
         """
-        for row in self.all_rows(after, SAMPLE):
-            try:
-                arrays = load_arrays(row.arrays or b"")
-            except (SafetensorError, ValueError, KeyError) as error:
-                raise RecordError(f"row {row.id} of {self.path} is damaged: {error}") from None
-            yield Sample(row.id, row.time, row.who, -1 if row.robot is None else row.robot, json.loads(row.fields), arrays)
+        return samples_in(self.path.parent, after)
 
     def head(self) -> Head:
         """The newest durable row: its id and hash."""
@@ -294,6 +289,26 @@ def verify_folder(folder: Path, noted: bytes | None = None) -> Verdict:
             return verify((Row(*row) for row in rows), head, noted)
     except sqlite3.Error as error:
         raise RecordError(f"{path} cannot be read: {error}") from None
+
+
+def samples_in(folder: Path, after: int = 0) -> Iterator[Sample]:
+    """`Audit.samples` of a record that another process may be writing.
+
+    Raises:
+        RecordError: there is no record, or a row's arrays are damaged.
+    """
+    path = folder / "record.sqlite"
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10.0)) as database:
+            query = f"SELECT {_COLUMNS} FROM record WHERE id > ? AND kind = ? ORDER BY id"
+            for row in (Row(*values) for values in database.execute(query, [after, SAMPLE])):
+                arrays = load_arrays(row.arrays or b"")
+                robot = -1 if row.robot is None else row.robot
+                yield Sample(row.id, row.time, row.who, robot, json.loads(row.fields), arrays)
+    except sqlite3.Error as error:
+        raise RecordError(f"{path} cannot be read: {error}") from None
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise RecordError(f"row {row.id} of {path} is damaged: {error}") from None
 
 
 def _connect(path: Path) -> sqlite3.Connection:
