@@ -1,0 +1,414 @@
+"""What a robot can do, as `tutelage robot` needs it, and the two drivers that simulate one.
+
+    class Arm:
+        observation_space = gym.spaces.Box(-np.inf, np.inf, (7,), np.float32)
+        action_space = gym.spaces.Box(-1, 1, (7,), np.float32)
+
+        def get_observation(self): return self.joints.read()
+        def send_action(self, action): self.joints.move(action)
+        def hold(self): self.joints.brake()
+
+That is a driver. `tutelage robot HOME --env my_package:Arm` puts it on the fleet. `check_driver` tries it out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.envs.registry import find_task, load_object, make_fleet, task_names
+from tutelage.errors import ConfigError, ContractError
+from tutelage.fleet.fleet import Fleet
+from tutelage.remote.wire import MAX_CAMERAS, Description, Malformed
+
+Array = NDArray[Any]
+Grab = Callable[[], Array]
+"""Takes a picture: (height, width, 3) uint8, RGB."""
+
+
+@runtime_checkable
+class Driver(Protocol):
+    """One robot. All methods but `stop` are called from one thread, and should return within a timestep.
+
+    A driver may have more:
+
+    * `reset(hard: bool, seed: int | None) -> None`: bring the robot into an initial state; hard: after a violation, which
+      may need a person on the spot. May take its time; returns when the robot is ready. Without it, the fleet can only
+      begin new episodes where the robot stands.
+    * `stop() -> None`: the emergency stop. Called at once, from another thread, also while `send_action` runs; and once more
+      after that. Without it, `hold` is called.
+    * `release() -> None`: the emergency stop was cleared.
+    * `violation()`, `success()`, `truncated() -> bool`: of the last step, see `Fleet`. They are believed until the next reset.
+    * `reward() -> float`: of the last step.
+    * `cameras() -> Mapping[str, Callable[[], rgb]]`: what takes a picture, (height, width, 3) uint8, by name.
+    * `close() -> None`.
+    * attributes `task` (a name), `horizon` (timesteps of an episode), `goal` (whether success means reaching a goal state).
+
+    Attributes:
+        observation_space: a Box of at most four dimensions; float32, float64 or uint8.
+        action_space: a Box (A,) with finite bounds. Actions are float32 and within them.
+    """
+
+    observation_space: gym.spaces.Box
+    action_space: gym.spaces.Box
+
+    def get_observation(self) -> Array:
+        """What the robot sees now. An array that the driver does not write into again."""
+        ...
+
+    def send_action(self, action: Array) -> None:
+        """Do this, and go on doing it until the next call."""
+        ...
+
+    def hold(self) -> None:
+        """Stand still, safely, until the next action. May be called many times in a row."""
+        ...
+
+
+class GymnasiumDriver:
+    """Any Gymnasium environment as a robot. An action is a step of it; while it holds, its time stands still.
+
+    Args:
+        env: the environment, or the id of a registered one.
+        violation: whether a step violated the constraint: (obs, reward, terminated, info) -> bool. Default: the environment
+            ended the episode without success.
+        success: whether a step completed the task, likewise. Default: `info["success"]` or `info["is_success"]`.
+        horizon: timesteps of an episode; default: the environment's own limit, or 1000.
+        kwargs: for `gymnasium.make`, with an id.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any] | str,
+        *,
+        violation: Callable[[Array, float, bool, dict[str, Any]], bool] | None = None,
+        success: Callable[[Array, float, bool, dict[str, Any]], bool] | None = None,
+        horizon: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if isinstance(env, str):
+            env = _make(env, kwargs)
+        box, seen = env.action_space, env.observation_space
+        if not isinstance(box, gym.spaces.Box) or not isinstance(seen, gym.spaces.Box):
+            raise ConfigError(f"a robot needs arrays as observations and actions (Box), not {seen} and {box}")
+        self.env = env
+        self.observation_space, self.action_space = seen, box
+        self.task = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+        self.horizon = horizon or getattr(env.spec, "max_episode_steps", None) or 1000
+        self._violates, self._succeeds = violation, success
+        self._obs: Array = np.zeros(seen.shape, seen.dtype)
+        self._reward, self._violation, self._success, self._truncated = 0.0, False, False, False
+        self._stopped = False
+
+    def get_observation(self) -> Array:
+        return self._obs
+
+    def send_action(self, action: Array) -> None:
+        if self._stopped or self._violation or self._success or self._truncated:
+            return
+        obs, reward, terminated, truncated, info = self.env.step(np.asarray(action, self.action_space.dtype))
+        given = (obs, float(reward), terminated, info)
+        self._obs, self._reward = np.array(obs), float(reward)
+        done = info.get("success", info.get("is_success", False))
+        self._success = bool(done if self._succeeds is None else self._succeeds(*given))
+        fell = terminated and not self._success
+        self._violation = bool(fell if self._violates is None else self._violates(*given)) and not self._success
+        self._truncated = bool(truncated or terminated)
+
+    def hold(self) -> None:
+        self._reward = 0.0
+
+    def reset(self, hard: bool, seed: int | None) -> None:
+        """Begin a new episode."""
+        obs, _ = self.env.reset(seed=seed)
+        self._obs = np.array(obs)
+        self._reward, self._violation, self._success, self._truncated = 0.0, False, False, False
+
+    def stop(self) -> None:
+        """Take no more actions."""
+        self._stopped = True
+
+    def release(self) -> None:
+        """Take actions again."""
+        self._stopped = False
+
+    def violation(self) -> bool:
+        """Has the episode violated the constraint?"""
+        return self._violation
+
+    def success(self) -> bool:
+        """Has the episode completed the task?"""
+        return self._success
+
+    def truncated(self) -> bool:
+        """Has the episode ended otherwise?"""
+        return self._truncated and not self._violation
+
+    def reward(self) -> float:
+        """Of the last step."""
+        return self._reward
+
+    def cameras(self) -> Mapping[str, Grab]:
+        """What the environment renders, if it was made with `render_mode="rgb_array"`."""
+        return {"front": self._picture} if self.env.render_mode == "rgb_array" else {}
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def _picture(self) -> Array:
+        return np.asarray(self.env.render(), dtype=np.uint8)
+
+
+class FleetDriver:
+    """A fleet of one simulated robot, such as `make_fleet("Navigation", 1)`, as a robot of its own.
+
+    Args:
+        fleet: N = 1.
+        task: its name.
+        width, height: of pictures, where the fleet draws any.
+    """
+
+    def __init__(self, fleet: Fleet, task: str = "", width: int = 320, height: int = 240) -> None:
+        if fleet.num_envs != 1:
+            raise ConfigError(f"a robot is a fleet of one, not of {fleet.num_envs}")
+        assert isinstance(fleet.single_observation_space, gym.spaces.Box)
+        assert isinstance(fleet.single_action_space, gym.spaces.Box)
+        self.fleet, self.task, self.size = fleet, task, (width, height)
+        self.observation_space, self.action_space = fleet.single_observation_space, fleet.single_action_space
+        self.horizon, self.goal = fleet.horizon, fleet.goal_conditioned
+        self._obs: Array = np.zeros((1, *self.observation_space.shape), self.observation_space.dtype)
+        self._reward, self._flags = 0.0, {"violation": False, "success": False, "truncated": False}
+        self._stopped = False
+
+    def get_observation(self) -> Array:
+        return self._obs[0]
+
+    def send_action(self, action: Array) -> None:
+        if self._stopped or any(self._flags.values()):
+            return
+        obs, reward, _, truncated, info = self.fleet.step(np.asarray(action, np.float32)[None])
+        self._obs, self._reward = obs, float(reward[0])
+        fell, done = bool(info["violation"][0]), bool(info["success"][0])
+        self._flags = {"violation": fell, "success": done, "truncated": bool(truncated[0]) and not fell}
+
+    def hold(self) -> None:
+        self._reward = 0.0
+
+    def reset(self, hard: bool, seed: int | None) -> None:
+        """Begin a new episode."""
+        self._obs, _ = self.fleet.reset(seed=seed)
+        self._reward, self._flags = 0.0, dict.fromkeys(self._flags, False)
+
+    def stop(self) -> None:
+        """Take no more actions."""
+        self._stopped = True
+
+    def release(self) -> None:
+        """Take actions again."""
+        self._stopped = False
+
+    def violation(self) -> bool:
+        """Has the episode violated the constraint?"""
+        return self._flags["violation"]
+
+    def success(self) -> bool:
+        """Has the episode completed the task?"""
+        return self._flags["success"]
+
+    def truncated(self) -> bool:
+        """Has the episode reached the horizon?"""
+        return self._flags["truncated"]
+
+    def reward(self) -> float:
+        """Of the last step."""
+        return self._reward
+
+    def cameras(self) -> Mapping[str, Grab]:
+        """A picture of the robot, where the fleet draws any."""
+        draw: Any = getattr(self.fleet, "render_robot", None)
+        if draw is None or not getattr(self.fleet, "render_mode", None):
+            return {}
+        if "width" in getattr(getattr(draw, "__code__", None), "co_varnames", ()):
+            return {"front": lambda: np.asarray(draw(0, *self.size))}
+        return {"front": lambda: np.asarray(draw(0))}
+
+    def close(self) -> None:
+        """Close the fleet."""
+        self.fleet.close()
+
+
+def make_driver(name: str, *, render: bool = True, size: tuple[int, int] = (320, 240)) -> Driver:
+    """The driver that a name stands for.
+
+    Args:
+        name: "module:callable" that returns a `Driver`, a Gymnasium environment or a fleet of one; a task of ours
+            ("Navigation"); or the id of a registered Gymnasium environment ("Pendulum-v1").
+        render: make simulators draw pictures.
+        size: of the pictures of our tasks, width and height.
+
+    Raises:
+        ConfigError: nothing of that name, or it makes something else.
+    """
+    if ":" in name:
+        made = load_object(name, "robot")()
+        if isinstance(made, gym.Env):
+            return GymnasiumDriver(made)
+        if isinstance(made, Fleet):
+            return FleetDriver(made, name.rpartition(":")[2], *size)
+        if not isinstance(made, Driver):
+            wanted = "a driver (get_observation, send_action, hold, and the two spaces)"
+            raise ConfigError(f"robot {name!r} must make {wanted}, a Gymnasium environment or a fleet of one")
+        return made
+    if name in task_names():
+        make: Any = find_task(name)
+        settings: dict[str, Any] = {"threads": 1} if isinstance(make, type) else {}
+        if render:
+            with contextlib.suppress(ConfigError):
+                return FleetDriver(make_fleet(name, 1, render_mode="rgb_array", **settings), name, *size)
+        return FleetDriver(make_fleet(name, 1, **settings), name, *size)
+    try:
+        gym.spec(name)
+    except gym.error.Error:
+        find_task(name)  # raises, and knows what else may have been meant
+    return GymnasiumDriver(name, **({"render_mode": "rgb_array"} if render else {}))
+
+
+def describe(driver: Driver, dt: float, cameras: tuple[str, ...] = ()) -> Description:
+    """What a driver says of itself, for the server.
+
+    Args:
+        dt: seconds of a timestep.
+        cameras: names of those whose pictures are sent.
+
+    Raises:
+        ContractError: spaces that a fleet cannot have.
+    """
+    seen, box = driver.observation_space, driver.action_space
+    kind = type(driver).__name__
+    for space, what in ((seen, "observation_space"), (box, "action_space")):
+        if not isinstance(space, gym.spaces.Box):
+            raise ContractError(f"{kind}.{what} must be a Box, got {space}")
+    if len(box.shape) != 1 or not np.isfinite([box.low, box.high]).all():
+        raise ContractError(f"{kind}.action_space must have shape (A,) and finite bounds, got {box}")
+    try:
+        return Description.from_json(
+            Description(
+                shape=tuple(int(size) for size in seen.shape),
+                dtype=np.dtype(seen.dtype).name,
+                action_low=tuple(map(float, box.low.astype(np.float32))),
+                action_high=tuple(map(float, box.high.astype(np.float32))),
+                horizon=int(getattr(driver, "horizon", 1000)),
+                task=str(getattr(driver, "task", "")),
+                goal=bool(getattr(driver, "goal", False)),
+                dt=float(dt),
+                cameras=cameras,
+            ).to_json()
+        )
+    except Malformed as error:
+        raise ContractError(f"{kind} cannot be put on a fleet: {error}") from None
+
+
+def check_driver(driver: Driver, *, seed: int = 0, steps: int = 50) -> None:
+    """Check that a driver keeps the promises of `Driver`. It moves the robot: random actions within the bounds!
+
+    Args:
+        driver: it is reset, if it can be, and gets `steps` actions, until an episode ends.
+        seed: of the reset and of the actions.
+
+    Raises:
+        ContractError: naming the broken clause.
+    """
+    name = type(driver).__name__
+    _demand(isinstance(driver, Driver), f"{name} is no driver; it needs get_observation, send_action, hold and the spaces")
+    describe(driver, 0.1)
+    reset, rng = getattr(driver, "reset", None), np.random.default_rng(seed)
+    if reset is not None:
+        reset(False, seed)
+        for flag in ("violation", "success", "truncated"):
+            _demand(not _flag(driver, name, flag), f"{name}.{flag}() must be False after a reset")
+    box = driver.action_space
+    _check_observation(driver, name)
+    for _ in range(steps):
+        action = rng.uniform(box.low, box.high).astype(np.float32)
+        kept = action.copy()
+        driver.send_action(action)
+        _demand(np.array_equal(action, kept), f"{name}.send_action changes the action that it is given; work on a copy")
+        _check_observation(driver, name)
+        flags = [_flag(driver, name, flag) for flag in ("violation", "success", "truncated")]
+        _demand(not (flags[0] and flags[1]), f"{name}: a robot in violation cannot be a success")
+        reward = getattr(driver, "reward", float)()
+        _demand(bool(np.isfinite(reward)), f"{name}.reward() must be a finite number, got {reward!r}")
+        if any(flags):
+            driver.send_action(action)
+            again = [_flag(driver, name, flag) for flag in ("violation", "success", "truncated")]
+            _demand(again == flags, f"{name}: what ended an episode must be said until the next reset")
+            break
+    for _ in range(3):
+        driver.hold()
+        _check_observation(driver, name)
+    if hasattr(driver, "stop"):
+        driver.stop()
+        driver.stop()
+        _check_observation(driver, name)
+        getattr(driver, "release", lambda: None)()
+    cameras = getattr(driver, "cameras", dict)()
+    _demand(isinstance(cameras, Mapping) and len(cameras) <= MAX_CAMERAS, f"{name}.cameras() must be at most {MAX_CAMERAS}")
+    for camera, grab in cameras.items():
+        picture = grab()
+        good = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
+        _demand(good, f"{name}: camera {camera!r} must give (height, width, 3) uint8")
+    if reset is not None:
+        reset(True, None)
+        _demand(not _flag(driver, name, "violation"), f"{name}: a hard reset must end a violation")
+        _check_observation(driver, name)
+
+
+def observation_of(driver: Driver) -> Array:
+    """What it sees, checked.
+
+    Raises:
+        ContractError: another shape or type than the space says, or a number that is not finite.
+    """
+    obs = np.asarray(driver.get_observation())
+    space = driver.observation_space
+    if obs.shape != space.shape or obs.dtype != space.dtype:
+        kind = type(driver).__name__
+        raise ContractError(f"{kind} must observe {space.shape} {space.dtype}, got {obs.shape} {obs.dtype}")
+    if obs.dtype.kind == "f" and not np.isfinite(obs).all():
+        raise ContractError(f"{type(driver).__name__} observed a number that is not finite")
+    return obs
+
+
+def _make(name: str, kwargs: dict[str, Any]) -> gym.Env[Any, Any]:
+    try:
+        return gym.make(name, **kwargs)
+    except gym.error.Error as error:
+        raise ConfigError(f"cannot make the environment {name!r}: {str(error).splitlines()[0]}") from error
+    except TypeError:
+        if "render_mode" not in kwargs:
+            raise
+        return gym.make(name, **{key: value for key, value in kwargs.items() if key != "render_mode"})
+
+
+def _check_observation(driver: Driver, name: str) -> None:
+    first = observation_of(driver)
+    kept = first.copy()
+    observation_of(driver)
+    _demand(np.array_equal(first, kept), f"{name}.get_observation overwrites what it returned before; return new arrays")
+
+
+def _flag(driver: Driver, name: str, flag: str) -> bool:
+    value = getattr(driver, flag, bool)()
+    _demand(isinstance(value, bool | np.bool_), f"{name}.{flag}() must be a bool, got {value!r}")
+    return bool(value)
+
+
+def _demand(clause: bool, message: str) -> None:
+    if not clause:
+        raise ContractError(message)

@@ -1,0 +1,442 @@
+"""The process on a robot's machine: observations out, commands in, and a robot that stands still whenever in doubt.
+
+    with Node.open(Path("arm-1")) as node, Robot(node, Arm()) as robot:
+        robot.run(ending)
+
+The robot acts at its own rate, in step with the commands while they come. Without a fresh command it holds; see `CommandGate`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.errors import ConfigError, TutelageError
+from tutelage.remote import jpeg, topics
+from tutelage.remote.driver import Driver, describe, observation_of
+from tutelage.remote.eyes import Eyes
+from tutelage.remote.gate import CommandGate
+from tutelage.remote.latch import Latch
+from tutelage.remote.wire import (
+    Answer,
+    Ask,
+    Command,
+    Counts,
+    Flag,
+    Malformed,
+    Observation,
+    Operation,
+    Order,
+    pack_answer,
+    pack_description,
+    pack_observation,
+    unpack_ask,
+)
+from tutelage.sgc.messages import Message
+from tutelage.sgc.node import Node
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[Any]
+
+EARLY, LATE = 0.75, 1.25
+"""Of a timestep: a command that comes so early begins the next one at once, and so late one is waited for."""
+
+WATCHED = 2.0
+"""Seconds after the last command for which the cameras go on that it wanted."""
+
+PATIENCE = 2.0
+"""Seconds for which a driver may fail without a break before the program ends."""
+
+ANSWERS = 64
+"""Resets that are recognised when they are asked for again."""
+
+
+class DriverFailed(TutelageError):
+    """The driver goes on failing; the robot was told to hold."""
+
+
+class OwnPolicy(Protocol):
+    """A policy on the robot."""
+
+    @property
+    def version(self) -> int:
+        """Of the weights; 0: there are none yet."""
+        ...
+
+    def act(self, obs: Array) -> Array:
+        """(1, ...) -> (1, A) float32."""
+        ...
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """How a robot behaves, whatever it is told.
+
+    Attributes:
+        hz: timesteps in a second.
+        watchdog: seconds after which an observation is too old for a command that answers it; then the robot holds.
+        slew: the largest change of an action in a second, as a fraction of its range; None: no limit.
+        camera_hz: pictures of a camera in a second, at most. quality: of JPEG.
+        seed: of the first episode; None: any.
+    """
+
+    hz: float = 10.0
+    watchdog: float = 0.5
+    slew: float | None = None
+    camera_hz: float = 10.0
+    quality: int = 80
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.hz <= 1000 or not 0.1 <= self.camera_hz <= 1000:
+            raise ConfigError(f"a robot's rates are 0.1 to 1000 Hz, not {self.hz:g} and {self.camera_hz:g}")
+        if not 0.02 <= self.watchdog <= 60:
+            raise ConfigError(f"the watchdog needs 0.02 to 60 seconds, not {self.watchdog:g}")
+        if self.watchdog * self.hz < 2:
+            raise ConfigError(
+                f"at {self.hz:g} Hz no command could be in time for a watchdog of {self.watchdog:g} s; "
+                f"give it at least {2 / self.hz:g}"
+            )
+        if self.slew is not None and not self.slew > 0:
+            raise ConfigError(f"a limit on the change of actions must be more than 0, not {self.slew:g}")
+        if not 1 <= self.quality <= 100:
+            raise ConfigError(f"the quality of pictures is 1 to 100, not {self.quality}")
+
+
+class Robot:
+    """One robot of a fleet. `run` is its loop; everything else happens on the network's threads."""
+
+    def __init__(
+        self,
+        node: Node,
+        driver: Driver,
+        config: RobotConfig | None = None,
+        report: Callable[[str], None] = lambda line: None,
+        policy: OwnPolicy | None = None,
+    ) -> None:
+        """
+        Args:
+            node: open; its name is the robot's. Not closed by `close`.
+            report: is told what a person at the robot would want to know, a line each.
+            policy: decides what the robot does itself, until the server overrides it.
+
+        Raises:
+            ConfigError: the node's policy has no robot of that name.
+            ContractError: the driver breaks its contract.
+        """
+        self.node, self.driver, self.config = node, driver, config or RobotConfig()
+        self.policy = policy
+        if node.name not in topics.robots_in(_alias_set(node)):
+            raise ConfigError(
+                f"the policy has no robot {node.name}: it needs the topics {topics.alias(node.name, topics.OBSERVATION)} and "
+                f"so on; write them with: tutelage fleet policy {node.name} ..."
+            )
+        self.boot = secrets.randbits(64) | 1
+        self._report = report
+        self._dt = 1.0 / self.config.hz
+        self._ending = threading.Event()
+        self._news = threading.Condition()
+        box = driver.action_space
+        self._low, self._high = box.low.astype(np.float32), box.high.astype(np.float32)
+        self.gate = CommandGate(self.boot, len(self._low), self.config.watchdog)
+        self.latch = Latch(node.home.path, self._stop_now, self._released)
+        self.asks = Counts()
+        self._asked: Ask | None = None
+        self._answers: OrderedDict[tuple[int, int], Answer] = OrderedDict()
+
+        self._number = self._episode = self._step = 0
+        self._return, self._last_action = 0.0, None
+        self._executed = 0
+        self._held = True
+        self._failing_since: float | None = None
+        self._obs: Array | None = None
+
+        self._reset(None if self.config.seed is None else self.config.seed, hard=False)
+        cameras = self._working_cameras()
+        threaded = bool(getattr(driver, "threaded_cameras", False))
+        self.eyes = Eyes(
+            self.boot, cameras, {name: node.publisher(topics.alias(node.name, topics.PICTURE, name)) for name in cameras},
+            hz=self.config.camera_hz, quality=self.config.quality, threaded=threaded,
+        )  # fmt: skip
+        self.description = describe(driver, self._dt, self.eyes.names)
+        self._observations = node.publisher(topics.alias(node.name, topics.OBSERVATION))
+        self._subscriptions = [
+            node.subscribe(topics.alias(node.name, topics.STOP), lambda message: self.latch.take(message.payload)),
+            node.subscribe(topics.alias(node.name, topics.COMMAND), self._on_command),
+        ]
+        self._service = node.serve(topics.alias(node.name, topics.SERVICE), self._on_ask)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Commands and other messages that were refused, by reason."""
+        return {**self.gate.counts.by_reason, **(self.latch.counts.by_reason + self.asks.by_reason)}
+
+    def run(self, ending: threading.Event | None = None) -> None:
+        """Work until `ending` is set, or `close` is called; then hold.
+
+        Raises:
+            DriverFailed: the driver failed for `PATIENCE` seconds on end.
+        """
+        began = time.monotonic()
+        first = True
+        try:
+            while not self._ending.is_set() and not (ending is not None and ending.is_set()):
+                if not first:
+                    self._wait(began, ending)
+                began, first = time.monotonic(), False
+                self._turn()
+        finally:
+            with contextlib.suppress(Exception):
+                self.driver.hold()
+
+    def close(self) -> None:
+        """End `run`, and leave the topics. The driver and the node stay open."""
+        self._ending.set()
+        with self._news:
+            self._news.notify_all()
+        self._service.close()
+        for subscription in self._subscriptions:
+            subscription.close()
+        self.eyes.close()
+        self._observations.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    # -- on the network's threads ------------------------------------------------------------------------------------------
+
+    def _on_command(self, message: Message) -> None:
+        with self._news:
+            if self.gate.take(message.payload, time.monotonic()):
+                self._news.notify_all()
+
+    def _on_ask(self, message: Message) -> bytes:
+        try:
+            ask = unpack_ask(message.payload)
+        except Malformed:
+            self.asks.add("malformed")
+            raise
+        if ask.operation == Operation.DESCRIBE:
+            return pack_description(self.description)
+        with self._news:
+            known = self._answers.get((ask.server, ask.number))
+            if known is None:
+                known = Answer(not self.latch.stopped, self.boot, self._episode)
+                if known.accepted:
+                    self._answers[ask.server, ask.number] = known
+                    while len(self._answers) > ANSWERS:
+                        self._answers.popitem(last=False)
+                    self._asked = ask
+                    self._news.notify_all()
+        return pack_answer(known)
+
+    def _stop_now(self) -> None:
+        """On the stop lane's thread: nothing comes before this."""
+        try:
+            getattr(self.driver, "stop", self.driver.hold)()
+        except Exception:
+            log.exception("%s: the driver's emergency stop failed; it is called again", self.node.name)
+        self._say("emergency stop", self.latch.stopped)
+        with self._news:
+            self._news.notify_all()
+
+    def _released(self) -> None:
+        with contextlib.suppress(Exception):
+            getattr(self.driver, "release", lambda: None)()
+        self._said_stop = False
+        self._report("the emergency stop is cleared")
+
+    _said_stop = False
+
+    def _say(self, line: str, stop: bool) -> None:
+        if stop and not self._said_stop:
+            self._said_stop = True
+            self._report(line)
+
+    # -- the loop ----------------------------------------------------------------------------------------------------------
+
+    def _wait(self, began: float, ending: threading.Event | None) -> None:
+        """Until the next timestep; holds on time if the command ceases to be fresh before that."""
+        executed = self._executed
+        stopped = self.latch.stopped
+        while not self._ending.is_set() and not (ending is not None and ending.is_set()):
+            now = time.monotonic()
+            command = self.gate.current(now)
+            if not self._held and command is None:
+                self._hold()
+                if self._obs is not None and self.gate.heard:
+                    self._report(f"holds: no fresh command for {self.config.watchdog:g} s")
+                return
+            new = command is not None and command.number != executed
+            due = began + self._dt * (LATE if command is not None and not new and not self._over() else EARLY if new else 1.0)
+            until = min(due, self.gate.until) if not self._held else due
+            with self._news:
+                if self._asked is not None or self.latch.stopped != stopped:
+                    return
+                again = self.gate.current(now)
+                if again is not command:
+                    continue
+                if due <= now:
+                    return
+                self._news.wait(min(until - now, 0.1))  # SIGTERM sets `ending` without a word to us
+
+    def _turn(self) -> None:
+        """One timestep: act or hold, look, tell."""
+        try:
+            asked, self._asked = self._asked, None
+            if asked is not None and not self.latch.stopped:
+                self._publish(self._flags() | Flag.RESETTING)
+                self._reset(asked.seed, hard=asked.operation == Operation.HARD_RESET)
+            self._act()
+            self._look()
+            self._failing_since = None
+        except Exception as error:
+            self._failed(error)
+            return
+        now = time.monotonic()
+        watched = self.gate.watch if now - self.gate.heard_at < WATCHED else 0
+        self._publish(self._flags())
+        self.eyes.look(watched, now)
+
+    def _act(self) -> None:
+        command = self.gate.current(time.monotonic())
+        self._executed = command.number if command is not None else self._executed
+        if self.latch.stopped:
+            getattr(self.driver, "stop", self.driver.hold)()
+            self._held, self._last_action = True, None
+            return
+        if command is None or not command.order & Order.ACT or self._over():
+            self._hold()
+            return
+        action = self._bounded(self._wanted(command))
+        self.driver.send_action(action)
+        if self.latch.stopped:  # while the action was being sent: the stop must be the last word
+            getattr(self.driver, "stop", self.driver.hold)()
+        if self._held:
+            self._report("moves")
+        self._held, self._last_action = False, action
+        self._step += 1
+        self._return += float(getattr(self.driver, "reward", float)())
+
+    def _wanted(self, command: Command) -> Array:
+        if command.order & Order.OWN and self.policy is not None and self._obs is not None:
+            return np.asarray(self.policy.act(self._obs[None])[0], dtype=np.float32)
+        return command.action
+
+    def _bounded(self, action: Array) -> Array:
+        bounded = np.clip(action, self._low, self._high)
+        if self.config.slew is not None:
+            most = np.float32(self.config.slew * self._dt) * (self._high - self._low)
+            before = np.clip(np.zeros_like(self._low), self._low, self._high) if self._last_action is None else self._last_action
+            bounded = np.clip(bounded, before - most, before + most)
+        return np.asarray(bounded, dtype=np.float32)
+
+    def _hold(self) -> None:
+        self._held, self._last_action = True, None
+        self.driver.hold()
+
+    def _look(self) -> None:
+        self._obs = observation_of(self.driver)
+
+    def _over(self) -> bool:
+        """Has the episode ended? Then the robot stands still until it is reset."""
+        return any(bool(getattr(self.driver, flag, bool)()) for flag in ("violation", "success", "truncated"))
+
+    def _reset(self, seed: int | None, *, hard: bool) -> None:
+        """Begin an episode: at the start of the program, or when the server asks."""
+        self._hold()
+        reset = getattr(self.driver, "reset", None)
+        if reset is not None:
+            reset(hard, seed)
+        self._episode += 1
+        self._step, self._return = 0, 0.0
+        self._look()
+        if self._episode > 1:
+            self._report(f"episode {self._episode} begins after a {'hard' if hard else 'soft'} reset")
+        with self._news:
+            self.gate.observed(self._number + 1, time.monotonic(), new_episode=True)
+
+    def _failed(self, error: Exception) -> None:
+        now = time.monotonic()
+        if self._failing_since is None:
+            self._failing_since = now
+            self._report(f"the driver failed: {type(error).__name__}: {error}")
+            log.warning("%s: the driver failed", self.node.name, exc_info=error)
+        with contextlib.suppress(Exception):
+            self._hold()
+        self._held = True
+        if now - self._failing_since > PATIENCE:
+            raise DriverFailed(f"the driver of {self.node.name} goes on failing: {type(error).__name__}: {error}") from error
+        if self._obs is not None:
+            with contextlib.suppress(Exception):
+                self._publish(self._flags() | Flag.FAULT)
+
+    def _flags(self) -> Flag:
+        flags = Flag(0)
+        if bool(getattr(self.driver, "violation", bool)()):
+            flags |= Flag.VIOLATION
+        elif bool(getattr(self.driver, "success", bool)()):
+            flags |= Flag.SUCCESS
+        if bool(getattr(self.driver, "truncated", bool)()) and not flags & Flag.VIOLATION:
+            flags |= Flag.TRUNCATED
+        if self._held:
+            flags |= Flag.HELD
+        return flags | Flag.STOPPED if self.latch.stopped else flags
+
+    def _publish(self, flags: Flag) -> None:
+        assert self._obs is not None
+        proposal, version = None, 0
+        if self.policy is not None and self.policy.version:
+            proposal, version = np.asarray(self.policy.act(self._obs[None])[0], np.float32), self.policy.version
+        now = time.monotonic()
+        with self._news:
+            self._number += 1
+            self.gate.observed(self._number, now)
+            heard = bool(self.gate.heard)
+            message = Observation(
+                self.boot, self._number, self._episode, self._step, flags, self.gate.server, self.gate.heard,
+                0 if self._held else self._executed, now - self.gate.heard_at if heard else 0.0, self._return,
+                self.gate.counts["stale"], self.gate.counts.total() - self.gate.counts["stale"] + self.latch.counts.total(),
+                version, self._obs, proposal,
+            )  # fmt: skip
+        try:
+            self._observations.send(pack_observation(message))
+        except TutelageError as error:  # no certificate any more, for instance; the robot holds, as no command can answer
+            log.warning("%s: %s", self.node.name, error)
+
+    def _working_cameras(self) -> dict[str, Callable[[], Array]]:
+        """Those that the policy names and that take a picture now."""
+        allowed = topics.cameras_in(self.node.name, _alias_set(self.node))
+        working = {}
+        for name, grab in getattr(self.driver, "cameras", dict)().items():
+            if name not in allowed:
+                self._report(f"camera {name} is not in the policy ({', '.join(allowed) or 'no cameras'}); it is left out")
+                continue
+            try:
+                if not jpeg.available():
+                    raise ConfigError("OpenCV is not installed; run: pip install 'tutelage[remote]'")
+                jpeg.encode(grab())
+            except Exception as error:
+                self._report(f"camera {name} gives no picture, and is left out: {error}")
+            else:
+                working[name] = grab
+        return working
+
+
+def _alias_set(node: Node) -> set[str]:
+    return set(node.access.topics)

@@ -1,0 +1,547 @@
+"""What robots and server say to each other: a header, fields of fixed size, then arrays; all little-endian.
+
+    "TR" | version | kind | fields | arrays: dtype, number of dimensions, shape, data
+
+Every message is checked here, at the edge: whoever gets one from `unpack_...` may rely on its ranges. Nothing that a message
+says sets aside more memory than the message has bytes.
+
+No field is a time of day. A robot finds out how old a command is from the number of the observation that it answers, which the
+robot sent itself, and a server how long a robot takes to answer from the number of the command that it last heard. So clocks
+need not agree.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.errors import TutelageError
+
+Array = NDArray[Any]
+
+VERSION = 1
+MAX_ARRAY = 16 << 20
+"""Bytes of the largest array."""
+MAX_PICTURE = 4 << 20
+"""Bytes of the largest picture, compressed."""
+MAX_SIDE = 8192
+"""Pixels of the longest side of a picture."""
+MAX_CAMERAS = 16
+MAX_TEXT = 64 << 10
+
+_MAGIC = b"TR"
+_HEAD = struct.Struct("<2sBB")
+_OBSERVATION = struct.Struct("<QQIIHHQQQfdIII")
+_COMMAND = struct.Struct("<QQQQHHf")
+_STOP = struct.Struct("<QQB")
+_ASK = struct.Struct("<QQBBQ")
+_ANSWER = struct.Struct("<BQI")
+_PICTURE = struct.Struct("<QQBHH")
+_WEIGHTS = struct.Struct("<II")
+_DTYPES = tuple(np.dtype(name) for name in ("<f4", "<f8", "u1", "<i2", "<i4", "<u2"))
+
+
+class Malformed(TutelageError):
+    """Bytes that are no message of this protocol."""
+
+
+class Kind(IntEnum):
+    """The fourth byte of a message."""
+
+    OBSERVATION = 1
+    COMMAND = 2
+    STOP = 3
+    ASK = 4
+    ANSWER = 5
+    PICTURE = 6
+    DESCRIPTION = 7
+    WEIGHTS = 8
+
+
+class Flag(IntFlag):
+    """The state of a robot, in its observations. All of them last until the episode ends or the state changes, so none is
+    missed when a message is."""
+
+    VIOLATION = 1  # c(s) = 1; stands still until it is reset
+    SUCCESS = 2  # the task is complete; stands still until it is reset
+    TRUNCATED = 4  # the episode has ended otherwise; likewise
+    HELD = 8  # stands still, as there is no fresh command
+    STOPPED = 16  # the emergency stop is latched
+    RESETTING = 32  # a reset is going on, and this is not yet the observation after it
+    FAULT = 64  # the driver failed lately
+
+
+class Order(IntFlag):
+    """What a command says beside the action."""
+
+    ACT = 1  # execute the action; without it: hold
+    HUMAN = 2  # the action is a human's
+    OWN = 4  # execute what the policy on the robot says
+
+
+class Operation(IntEnum):
+    """What a robot's service is asked to do."""
+
+    DESCRIBE = 0
+    SOFT_RESET = 1
+    HARD_RESET = 2
+
+
+class StopOperation(IntEnum):
+    """What the emergency stop's lane says."""
+
+    STOP = 1
+    CLEAR = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a robot sees, and how it is.
+
+    Attributes:
+        boot: 64 random bits of this start of the robot.
+        number: of this observation, counted from 1 since the start.
+        episode: counted from 1 since the start.
+        step: timesteps of the episode so far.
+        flags: the robot's state.
+        server, heard: start and number of the newest command that arrived, whether it was executed or not; 0: none.
+        executed: number of the command that was executed in this step; 0: none, the robot was held.
+        waited: seconds from the arrival of that command to the sending of this, on the robot's clock.
+        episode_return: sum of the rewards of the episode.
+        stale, refused: commands that came too late, and messages that were no commands for this robot; since the start.
+        policy: version of the policy on the robot; 0: none.
+        obs: what is observed, of the described shape and type.
+        proposal: (A,) float32, what the policy on the robot would do, if there is one.
+    """
+
+    boot: int
+    number: int
+    episode: int
+    step: int
+    flags: Flag
+    server: int
+    heard: int
+    executed: int
+    waited: float
+    episode_return: float
+    stale: int
+    refused: int
+    policy: int
+    obs: Array
+    proposal: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What a robot shall do until its next command.
+
+    Attributes:
+        server: 64 random bits of this start of the server.
+        number: of this command, counted from 1 since the start.
+        boot, answers: start of the robot and number of the observation that this answers; the robot drops it when that
+            observation is too old.
+        order: what kind of command. watch: a bit for each camera whose pictures are wanted.
+        period: seconds until the next command is to be expected.
+        action: (A,) float32; empty where there is nothing to execute.
+    """
+
+    server: int
+    number: int
+    boot: int
+    answers: int
+    order: Order
+    watch: int
+    period: float
+    action: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """The emergency stop, or its end. Repeated until the robot's observations show it."""
+
+    server: int
+    number: int
+    operation: StopOperation
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A request to a robot. The same server and number again is the same request.
+
+    Attributes:
+        seed: for the new episode, or None.
+    """
+
+    server: int
+    number: int
+    operation: Operation
+    seed: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A robot's answer: a reset is accepted, and will end in an episode later than this one.
+
+    Attributes:
+        accepted: False: not now (the emergency stop is latched).
+    """
+
+    accepted: bool
+    boot: int
+    episode: int
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """What a camera sees, as JPEG.
+
+    Attributes:
+        camera: index in the description. width, height: pixels.
+    """
+
+    boot: int
+    number: int
+    camera: int
+    width: int
+    height: int
+    jpeg: bytes
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a robot is; all robots of a fleet are alike.
+
+    Attributes:
+        shape, dtype: of an observation; dtype is float32, float64 or uint8.
+        action_low, action_high: bounds of an action.
+        horizon: timesteps of an episode.
+        task: its name, "" for none.
+        goal: whether success means reaching a goal state.
+        dt: seconds of a timestep of the robot.
+        cameras: names.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    horizon: int = 1000
+    task: str = ""
+    goal: bool = False
+    dt: float = 0.1
+    cameras: tuple[str, ...] = ()
+
+    def matches(self, other: Description) -> bool:
+        """Can the two be in one fleet: same observations, same actions, same task?"""
+        return (self.shape, self.dtype, self.action_low, self.action_high, self.task) == (
+            other.shape, other.dtype, other.action_low, other.action_high, other.task
+        )  # fmt: skip
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain values; `from_json` reads them."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+
+    @classmethod
+    def from_json(cls, table: Any) -> Description:
+        """Read and check.
+
+        Raises:
+            Malformed: naming the field.
+        """
+        if not isinstance(table, Mapping) or set(table) != set(cls.__dataclass_fields__):
+            raise Malformed("a description with other fields")
+
+        def check(name: str, good: bool) -> None:
+            if not good:
+                raise Malformed(f"a description whose {name} is impossible")
+
+        def numbers(name: str, least: int, most: int, *kinds: type) -> tuple[Any, ...]:
+            value = table[name]
+            check(name, isinstance(value, list) and least <= len(value) <= most and all(type(x) in kinds for x in value))
+            return tuple(value)
+
+        shape = numbers("shape", 1, 4, int)
+        check("shape", all(0 < size <= MAX_ARRAY for size in shape) and math.prod(shape) <= MAX_ARRAY // 8)
+        check("dtype", table["dtype"] in ("float32", "float64", "uint8"))
+        low, high = (
+            tuple(map(float, numbers(name, 1, 4096, int, float))) for name in ("action_low", "action_high")
+        )
+        good = len(low) == len(high) and all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True))
+        check("action_low", good)
+        check("horizon", type(table["horizon"]) is int and 0 < table["horizon"] < 1 << 31)
+        check("task", isinstance(table["task"], str) and len(table["task"]) <= 200)
+        check("goal", isinstance(table["goal"], bool))
+        check("dt", type(table["dt"]) in (int, float) and 0 < table["dt"] < 1e4)
+        cameras = numbers("cameras", 0, MAX_CAMERAS, str)
+        check("cameras", all(0 < len(name) <= 40 for name in cameras) and len(set(cameras)) == len(cameras))
+        return cls(
+            shape, table["dtype"], low, high, table["horizon"], table["task"], table["goal"], float(table["dt"]), cameras
+        )
+
+
+@dataclass
+class Counts:
+    """How often something was refused, by reason; for one thread, or where a lost count does no harm."""
+
+    by_reason: Counter[str] = field(default_factory=Counter)
+
+    def add(self, reason: str) -> None:
+        """Count."""
+        self.by_reason[reason] += 1
+
+    def __getitem__(self, reason: str) -> int:
+        return self.by_reason[reason]
+
+    def total(self) -> int:
+        """All of them."""
+        return self.by_reason.total()
+
+
+# -- to bytes -------------------------------------------------------------------------------------------------------------
+
+
+def pack_observation(o: Observation) -> bytes:
+    """See `Observation`."""
+    head = _OBSERVATION.pack(
+        o.boot, o.number, o.episode, o.step, o.flags, 1 if o.proposal is None else 2, o.server, o.heard, o.executed,
+        o.waited, o.episode_return, o.stale & 0xFFFFFFFF, o.refused & 0xFFFFFFFF, o.policy,
+    )  # fmt: skip
+    arrays = _array(o.obs) if o.proposal is None else _array(o.obs) + _array(o.proposal)
+    return _head(Kind.OBSERVATION) + head + arrays
+
+
+def pack_command(c: Command) -> bytes:
+    """See `Command`."""
+    head = _COMMAND.pack(c.server, c.number, c.boot, c.answers, c.order, c.watch, c.period)
+    return _head(Kind.COMMAND) + head + _array(c.action)
+
+
+def pack_stop(s: Stop) -> bytes:
+    """See `Stop`."""
+    return _head(Kind.STOP) + _STOP.pack(s.server, s.number, s.operation)
+
+
+def pack_ask(a: Ask) -> bytes:
+    """See `Ask`."""
+    return _head(Kind.ASK) + _ASK.pack(a.server, a.number, a.operation, a.seed is not None, a.seed or 0)
+
+
+def pack_answer(a: Answer) -> bytes:
+    """See `Answer`."""
+    return _head(Kind.ANSWER) + _ANSWER.pack(a.accepted, a.boot, a.episode)
+
+
+def pack_picture(p: Picture) -> bytes:
+    """See `Picture`."""
+    return _head(Kind.PICTURE) + _PICTURE.pack(p.boot, p.number, p.camera, p.width, p.height) + p.jpeg
+
+
+def pack_description(d: Description) -> bytes:
+    """See `Description`."""
+    return _head(Kind.DESCRIPTION) + json.dumps(d.to_json()).encode()
+
+
+# -- from bytes -----------------------------------------------------------------------------------------------------------
+
+
+def unpack_observation(data: bytes) -> Observation:
+    """Read an observation; the arrays are read-only views.
+
+    Raises:
+        Malformed: not one.
+    """
+    body = _body(data, Kind.OBSERVATION)
+    boot, number, episode, step, flags, arrays, server, heard, executed, waited, total, stale, refused, policy = _fields(
+        _OBSERVATION, body
+    )
+    if not (boot and number and episode) or flags >= 2 * Flag.FAULT or arrays not in (1, 2):
+        raise Malformed("an observation with a field out of range")
+    if not (math.isfinite(waited) and waited >= 0 and math.isfinite(total)):
+        raise Malformed("an observation with a number that is not finite")
+    obs, at = _read_array(body, _OBSERVATION.size)
+    proposal = None
+    if arrays == 2:
+        proposal, at = _read_array(body, at)
+        if proposal.ndim != 1 or proposal.dtype != np.float32:
+            raise Malformed("a proposal that is no vector of float32")
+    _ends(body, at)
+    return Observation(
+        boot, number, episode, step, Flag(flags), server, heard, executed, waited, total, stale, refused, policy, obs, proposal
+    )
+
+
+def unpack_command(data: bytes) -> Command:
+    """Read a command.
+
+    Raises:
+        Malformed: not one.
+    """
+    body = _body(data, Kind.COMMAND)
+    server, number, boot, answers, order, watch, period = _fields(_COMMAND, body)
+    if not (server and number) or order >= 2 * Order.OWN or not (math.isfinite(period) and period >= 0):
+        raise Malformed("a command with a field out of range")
+    action, at = _read_array(body, _COMMAND.size)
+    _ends(body, at)
+    if action.ndim != 1 or action.dtype != np.float32:
+        raise Malformed("an action that is no vector of float32")
+    return Command(server, number, boot, answers, Order(order), watch, period, action)
+
+
+def unpack_stop(data: bytes) -> Stop:
+    """Read an emergency stop.
+
+    Raises:
+        Malformed: not one.
+    """
+    body = _body(data, Kind.STOP)
+    server, number, operation = _fields(_STOP, body)
+    _ends(body, _STOP.size)
+    if not (server and number) or operation not in set(StopOperation):
+        raise Malformed("a stop with a field out of range")
+    return Stop(server, number, StopOperation(operation))
+
+
+def unpack_ask(data: bytes) -> Ask:
+    """Read a request.
+
+    Raises:
+        Malformed: not one.
+    """
+    body = _body(data, Kind.ASK)
+    server, number, operation, seeded, seed = _fields(_ASK, body)
+    _ends(body, _ASK.size)
+    if not (server and number) or operation not in set(Operation) or seeded > 1 or (seed and not seeded):
+        raise Malformed("a request with a field out of range")
+    return Ask(server, number, Operation(operation), seed if seeded else None)
+
+
+def unpack_answer(data: bytes) -> Answer:
+    """Read an answer.
+
+    Raises:
+        Malformed: not one.
+    """
+    body = _body(data, Kind.ANSWER)
+    accepted, boot, episode = _fields(_ANSWER, body)
+    _ends(body, _ANSWER.size)
+    if accepted > 1 or not boot:
+        raise Malformed("an answer with a field out of range")
+    return Answer(bool(accepted), boot, episode)
+
+
+def unpack_picture(data: bytes) -> Picture:
+    """Read a picture. Its JPEG is not decoded, but has the size that the message says.
+
+    Raises:
+        Malformed: not one.
+    """
+    if len(data) > MAX_PICTURE:
+        raise Malformed("a picture that is too large")
+    body = _body(data, Kind.PICTURE)
+    boot, number, camera, width, height = _fields(_PICTURE, body)
+    if not (boot and number and 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE) or camera >= MAX_CAMERAS:
+        raise Malformed("a picture with a field out of range")
+    jpeg = bytes(body[_PICTURE.size :])
+    if jpeg_size(jpeg) != (width, height):
+        raise Malformed("a picture that is no JPEG of the size that it says")
+    return Picture(boot, number, camera, width, height, jpeg)
+
+
+def unpack_description(data: bytes) -> Description:
+    """Read a description.
+
+    Raises:
+        Malformed: not one.
+    """
+    if len(data) > MAX_TEXT:
+        raise Malformed("a description that is too long")
+    try:
+        table = json.loads(bytes(_body(data, Kind.DESCRIPTION)))
+    except (ValueError, RecursionError):
+        raise Malformed("a description that is no JSON") from None
+    return Description.from_json(table)
+
+
+def jpeg_size(jpeg: bytes) -> tuple[int, int] | None:
+    """Width and height that a JPEG file says it has; None: it is none."""
+    if jpeg[:2] != b"\xff\xd8":
+        return None
+    at = 2
+    while at + 9 <= len(jpeg):
+        if jpeg[at] != 0xFF:
+            return None
+        marker = jpeg[at + 1]
+        if marker == 0xFF:  # padding
+            at += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", jpeg, at + 5)
+            return int(width), int(height)
+        (length,) = struct.unpack_from(">H", jpeg, at + 2)
+        if length < 2 or marker in (0xD8, 0xD9, 0xDA):
+            return None
+        at += 2 + length
+    return None
+
+
+def _head(kind: Kind) -> bytes:
+    return _HEAD.pack(_MAGIC, VERSION, kind)
+
+
+def _body(data: bytes, kind: Kind) -> memoryview:
+    if len(data) < _HEAD.size:
+        raise Malformed("a message that is too short")
+    magic, version, found = _HEAD.unpack_from(data)
+    if magic != _MAGIC:
+        raise Malformed("bytes of another protocol")
+    if version != VERSION:
+        raise Malformed(f"a message of version {version}; this program speaks version {VERSION}: update the older end")
+    if found != kind:
+        raise Malformed(f"a message of kind {found} where kind {int(kind)} belongs")
+    return memoryview(data)[_HEAD.size :]
+
+
+def _fields(layout: struct.Struct, body: memoryview) -> tuple[Any, ...]:
+    if len(body) < layout.size:
+        raise Malformed("a message that is too short")
+    return layout.unpack_from(body)
+
+
+def _ends(body: memoryview, at: int) -> None:
+    if at != len(body):
+        raise Malformed("a message that goes on after its end")
+
+
+def _array(array: Array) -> bytes:
+    little = array.dtype.newbyteorder("<") if array.dtype.itemsize > 1 else array.dtype
+    code = _DTYPES.index(np.dtype(little))
+    shape = struct.pack(f"<BB{array.ndim}I", code, array.ndim, *array.shape)
+    return shape + np.ascontiguousarray(array, dtype=little).tobytes()
+
+
+def _read_array(body: memoryview, at: int) -> tuple[Array, int]:
+    if at + 2 > len(body):
+        raise Malformed("a message that ends before an array")
+    code, dimensions = body[at], body[at + 1]
+    at += 2
+    if code >= len(_DTYPES) or dimensions > 4 or at + 4 * dimensions > len(body):
+        raise Malformed("an array of no known kind")
+    shape = struct.unpack_from(f"<{dimensions}I", body, at)
+    at += 4 * dimensions
+    dtype = _DTYPES[code]
+    size = math.prod(shape) * dtype.itemsize
+    if size > MAX_ARRAY or size > len(body) - at:
+        raise Malformed("an array that is longer than its message")
+    array = np.frombuffer(body, dtype, math.prod(shape), at).reshape(shape)
+    if dtype.kind == "f" and not np.isfinite(array).all():
+        raise Malformed("an array with a number that is not finite")
+    return array, at + size
