@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tutelage.errors import ConfigError
+from tutelage.fleet.allocation import FirstComeFirstServed
 from tutelage.fleet.events import Events
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.metrics import EventLog, summary
@@ -146,6 +147,32 @@ def test_a_person_may_reset_a_robot_that_is_stuck_and_takes_as_long_as_it_takes(
     steps += [loop.step(), loop.step()]
     assert modes(steps) == [T, *[R] * 9, T]
     assert fleet.obs[0, 2] == 1, "a new episode"
+
+
+# -- who is next, and what the others do meanwhile ---------------------------------------------------------------------
+
+
+def test_first_come_first_served_whatever_the_ranks_and_nobody_is_called_away() -> None:
+    need = {0: [0, 1, 0], 1: [5, 1, 0], 2: [5, 1, 9], 3: [5, 0, 9], 4: [5, 0, 9], 5: [0, 0, 9]}
+    loop = make_loop(PointFleet(3), FakePriority(lambda view: need[view.t]), 1, allocator=FirstComeFirstServed(1))
+    assert [int(loop.step().human.argmax()) for _ in range(6)] == [1, 1, 1, 0, 0, 2]
+
+
+def test_the_queue_survives_a_resume() -> None:
+    first, second = (make_loop(PointFleet(3), wants([1, 1, 1]), 1, allocator=FirstComeFirstServed(1)) for _ in range(2))
+    for _ in range(4):
+        first.step()
+    second.load_state_dict(first.state_dict())
+    assert second.allocator.needed.tolist() == [4, 4, 4]
+
+
+def test_robots_that_need_a_human_may_wait_for_one() -> None:
+    fleet = PointFleet(3)
+    loop = make_loop(fleet, wants([2, 1, 0]), 1, wait=True)
+    step = loop.step()
+    assert step.held.tolist() == [False, True, False]
+    assert step.mode.tolist() == [T, A, A]
+    assert fleet.moved[-1].tolist() == step.moved.tolist() == [True, False, True]
 
 
 def test_people_need_a_fleet_that_can_pause() -> None:

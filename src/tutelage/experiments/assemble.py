@@ -19,7 +19,7 @@ from tutelage.envs.tasks import TASKS
 from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.experiments.config import RunConfig
-from tutelage.fleet.allocation import FleetDAgger
+from tutelage.fleet.allocation import FirstComeFirstServed, FleetDAgger
 from tutelage.fleet.discrepancy import discrepancy
 from tutelage.fleet.execution import BetaMixture, Execution, NoiseInjection
 from tutelage.fleet.fleet import Fleet
@@ -68,13 +68,15 @@ class Assembly:
             raise ConfigError(f"{c.priority} needs a task with a goal, and {c.task} has none; use C.U.R. or U.C.")
         kinds = self._supervisors()
         team = Team([kinds[j % len(kinds)] for j in range(c.humans)], c.latency)
-        omega = FleetDAgger(c.t_teleop, c.t_reset)
+        omega = (FirstComeFirstServed if c.queue == "fifo" else FleetDAgger)(c.t_teleop, c.t_reset)
         signals = self._signals()
         if frozen is not None:
-            return Loop(self.fleet, frozen, priority, team, omega, signals=signals, seed=derive(c.seed, "evaluation"))
+            return Loop(
+                self.fleet, frozen, priority, team, omega, signals=signals, wait=c.wait, seed=derive(c.seed, "evaluation")
+            )
         return Loop(
             self.fleet, self.policy, priority, team, omega, self.learner, signals,
-            execution=self._execution(priority), overlap=c.overlap, seed=c.seed,
+            execution=self._execution(priority), overlap=c.overlap, wait=c.wait, seed=c.seed,
         )  # fmt: skip
 
     def _kinds(self) -> list[PolicySupervisor]:

@@ -39,6 +39,8 @@ class RunConfig:
         t_teleop: t_T, minimum timesteps of a teleoperation.
         t_reset: t_R, timesteps of a hard reset.
         latency: L, timesteps between an assignment and its beginning; the robot waits.
+        queue: who is next: "priority", the robot that needs a human most; or "fifo", the one that has for longest.
+        wait: robots that need a human stand still until one comes, instead of going on by themselves meanwhile.
         disturbance: level of the world's disturbances; default: the task's own.
         success_return: the return that makes an episode of a task without a goal a success; default: 95 % of the expert's
             at this level.
@@ -77,6 +79,8 @@ class RunConfig:
     t_teleop: int = 5
     t_reset: int = 5
     latency: int = 0
+    queue: Literal["priority", "fifo"] = "priority"
+    wait: bool = False
     disturbance: str | None = None
     success_return: float | None = None
     observation: Literal["state", "images"] = "state"
@@ -117,6 +121,8 @@ class RunConfig:
                 raise ConfigError(f"hidden layers must be at least 1 wide, got {hidden}")
         if self.observation not in ("state", "images"):
             raise ConfigError(f"unknown observation {self.observation!r}: use state or images")
+        if self.queue not in ("priority", "fifo"):
+            raise ConfigError(f"unknown queue {self.queue!r}: use priority or fifo")
         if self.record not in ("human", "all", "none"):
             raise ConfigError(f"unknown record {self.record!r}: use human, all or none")
 

@@ -67,6 +67,37 @@ class FleetDAgger:
         )
         return np.asarray((previous != NOBODY) & busy)
 
+    def state_dict(self) -> dict[str, Any]:
+        """What it remembers between timesteps: nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class FirstComeFirstServed(FleetDAgger):
+    """Algorithm 4 with a queue in place of priorities: who has needed somebody for longest is next (appendix B.4).
+
+    A robot that has a human stays first for as long as it needs one, so nobody is called away.
+    """
+
+    def __init__(self, t_teleop: int = 5, t_reset: int = 5) -> None:
+        super().__init__(t_teleop, t_reset)
+        self.needed: Array = np.zeros(0)
+
+    def __call__(self, ranks: Array, previous: Array, mode: Array, age: Array, rng: np.random.Generator) -> Array:
+        needy = (ranks > 0).any(axis=1)
+        self.needed = np.where(needy, 1.0 + (self.needed if len(self.needed) else 0.0), 0.0)
+        return super().__call__(self.needed[:, None], previous, mode, age, rng)
+
+    def state_dict(self) -> dict[str, Any]:
+        """For how many timesteps each robot has needed somebody."""
+        return {"needed": self.needed.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.needed = state["needed"].copy()
+
 
 def highest(ranks: Array, k: int, exclude: Array, rng: np.random.Generator) -> Array:
     """The at most k robots of highest positive priority that are not in `exclude`, from highest to lowest (line 13).

@@ -46,6 +46,7 @@ class Loop:
         execution: what a robot executes while a human is in control; by default what the human wants.
         overlap: learn while physics runs. The update at step t then sees the data up to t - 1; it still changes the
             policy from t + 1 on.
+        wait: robots that need a human stand still until one is with them, instead of going on by themselves meanwhile.
         seed: root seed.
     """
 
@@ -61,15 +62,17 @@ class Loop:
         subscribers: Sequence[Subscriber] = (),
         execution: Execution | None = None,
         overlap: bool = False,
+        wait: bool = False,
         seed: int = 0,
     ) -> None:
         if len(team) > fleet.num_envs:
             raise ConfigError(f"{len(team)} humans for {fleet.num_envs} robots: use at most one human a robot (M <= N)")
-        if team.pauses and not fleet.can_pause:
-            raise ConfigError("switching latency needs a fleet that can pause robots, and this one cannot")
+        if not fleet.can_pause and (team.pauses or wait):
+            reason = "waiting for a human" if wait else "switching latency"
+            raise ConfigError(f"{reason} needs a fleet that can pause robots, and this one cannot")
         self.fleet, self.policy, self.priority, self.team = fleet, policy, priority, team
         self.allocator, self.execution = allocator or FleetDAgger(), execution or AsWanted()
-        self.learner, self.overlap, self.subscribers = learner, overlap, list(subscribers)
+        self.learner, self.overlap, self.wait, self.subscribers = learner, overlap, wait, list(subscribers)
         self.signals: dict[str, Signal] = {"uncertainty": lambda view: policy.uncertainty(view.obs)}  # type: ignore[attr-defined]
         if not hasattr(policy, "uncertainty"):
             del self.signals["uncertainty"]
@@ -110,8 +113,9 @@ class Loop:
         self.journal.t, self.in_step = self.t, True
         self._reach()
         view = self._observe()
-        self._allocate(self.priority(view))
-        (actions, wanted, held), mode, human = self._act(view), self.mode.copy(), self.human_of
+        waiting = self._allocate(self.priority(view))
+        (actions, wanted, silent), mode, human = self._act(view), self.mode.copy(), self.human_of
+        held = silent | waiting
         losses: dict[str, float] = {}
 
         self.fleet.step_async(actions, active=MOVING[mode] & ~held)
@@ -124,7 +128,7 @@ class Loop:
         self._finish(next_obs, info["violation"], success, truncated, held)
         step = Step(
             self.t, view.obs, view.actions, actions, wanted, mode, human, reward, next_obs,
-            info["violation"], success, truncated, self.journal.take(), view.computed, losses,
+            info["violation"], success, truncated, self.journal.take(), view.computed, losses, held,
         )  # fmt: skip
         if self.learner:
             self.learner.record(step)
@@ -169,7 +173,8 @@ class Loop:
             self.fresh, len(self.team), self.rng, self.signals,
         )  # fmt: skip
 
-    def _allocate(self, ranks: Array) -> None:
+    def _allocate(self, ranks: Array) -> Array:
+        """Send the humans to the robots; returns who stands still until somebody comes, (N,) bool."""
         if ranks.ndim != 2 or len(ranks) != self.fleet.num_envs or not ranks.shape[1]:
             raise ContractError(f"a priority must return ({self.fleet.num_envs}, K), got {ranks.shape}")
         before = self.robot_of
@@ -199,24 +204,25 @@ class Loop:
         self._happen(Event.TAKE_OVER, robots[ready & ~broken], busy[ready & ~broken])
         stuck = (self.mode[robots] == Mode.TELEOPERATED) & self.team.resets(robots, busy)
         self._happen(Event.START_RESET, robots[stuck], busy[stuck])
+        return np.asarray(self.wait & (ranks > 0).any(axis=1) & (self.mode == Mode.AUTONOMOUS))
 
     def _act(self, view: FleetView) -> tuple[Array, Array, Array]:
-        """What the robots are to do, what the humans want (N, A), and who is held because its human says nothing (N,)."""
+        """What the robots are to do and what the humans want, (N, A), and whose human says nothing, (N,) bool."""
         actions = view.actions.astype(np.float32, copy=True)
         wanted, self.discrepancy = np.full_like(actions, np.nan), np.full(len(actions), np.nan)
-        held = np.zeros(len(actions), dtype=bool)
+        silent = np.zeros(len(actions), dtype=bool)
         (robots,) = np.nonzero(self.mode == Mode.TELEOPERATED)
         if robots.size:
             low, high = self.fleet.action_low, self.fleet.action_high
             said = np.clip(self.team.act(view.obs[robots], robots, self.human_of[robots], actions.shape[1]), low, high)
-            silent = np.isnan(said).any(axis=1)
-            if silent.any():
-                held[robots[silent]] = True
-                robots, said = robots[~silent], said[~silent]
+            nothing = np.isnan(said).any(axis=1)
+            if nothing.any():
+                silent[robots[nothing]] = True
+                robots, said = robots[~nothing], said[~nothing]
             wanted[robots] = self.human_action[robots] = said
             self.discrepancy[robots] = discrepancy(view.actions[robots], said, low, high)
             actions[robots] = np.clip(self.execution(self.t, said, view.actions[robots]), low, high)
-        return actions, wanted, held
+        return actions, wanted, silent
 
     def _finish(self, obs: Array, violation: Array, success: Array, truncated: Array, held: Array) -> None:
         """End of the step: note what happened, reset whom it is due, and look again."""
@@ -274,6 +280,7 @@ class Loop:
             "team": self.team.state_dict(),
             "priority": self.priority.state_dict(),
             "execution": self.execution.state_dict(),
+            "allocator": self.allocator.state_dict(),
             **({"learner": self.learner.state_dict()} if self.learner else {}),
         }
 
@@ -288,5 +295,7 @@ class Loop:
         self.team.load_state_dict(state["team"])
         self.priority.load_state_dict(state["priority"])
         self.execution.load_state_dict(state["execution"])
+        if "allocator" in state:  # one without memory leaves nothing in a file
+            self.allocator.load_state_dict(state["allocator"])
         if self.learner:
             self.learner.load_state_dict(state["learner"])

@@ -27,8 +27,7 @@ class Step:
         obs: (N, ...) what the robots saw.
         proposed: (N, A) what the policy would do.
         actions: (N, A) what was executed.
-        wanted: (N, A) what the humans wanted where teleoperated (executed unless an `Execution` changes it), else NaN. NaN
-            also where a person gave no fresh command: that robot was held.
+        wanted: (N, A) what the humans wanted where teleoperated (executed unless an `Execution` changes it), else NaN.
         mode: (N,) the `Mode` of each robot during the step.
         human: (N,) the human who helps each robot during the step, or -1.
         reward: (N,) float64.
@@ -39,6 +38,8 @@ class Step:
         events: what happened before, during and at the end of the step.
         signals: the signals that the priority looked at, by name, (N,) each.
         losses: what learning reported in this step, by name.
+        held: (N,) bool, robots that stood still although they are autonomous or teleoperated: their person gave no fresh
+            command (then `wanted` is NaN), or they wait for somebody to come. None: nobody.
     """
 
     t: int
@@ -56,12 +57,12 @@ class Step:
     events: Events
     signals: dict[str, Array] = field(default_factory=dict)
     losses: dict[str, float] = field(default_factory=dict)
+    held: Array | None = None
 
     @cached_property
     def moved(self) -> Array:
-        """(N,) bool, whose physics went on: autonomous robots, and teleoperated ones whose human commanded something."""
-        silent = (self.mode == Mode.TELEOPERATED) & np.isnan(self.wanted).any(axis=1)
-        return np.asarray(MOVING[self.mode] & ~silent)
+        """(N,) bool, whose physics went on: autonomous and teleoperated robots that were not held."""
+        return np.asarray(MOVING[self.mode] if self.held is None else MOVING[self.mode] & ~self.held)
 
     @cached_property
     def taught(self) -> Array:
