@@ -185,7 +185,18 @@ class Accounts:
             LoginError: wrong name or password.
             TooManyAttemptsError: of this name from this address, of this name, or from this address.
         """
-        name, place = name.strip().lower()[:64], network_of(address)
+        name = name.strip().lower()[:64]
+        kept = self.confirm(name, password, address)
+        if self.passwords.outdated(kept):
+            self._query("UPDATE accounts SET password = ? WHERE name = ?", self.passwords.hash(password, name), name)
+        try:
+            return self.begin(name, replaces)
+        except ConfigError:  # removed while the password was checked
+            raise LoginError("wrong name or password") from None
+
+    def confirm(self, name: str, password: str, address: str) -> str:
+        """Check a password, with the limits of `login`; returns what is kept of it."""
+        place = network_of(address)
         counted: list[tuple[Window, str]] = []
         for window, key in self._windows:
             wait = window.attempt(key(name, place))
@@ -200,12 +211,7 @@ class Accounts:
             raise LoginError("wrong name or password")
         for window, its_key in counted:
             window.forgive(its_key)
-        if kept and self.passwords.outdated(kept):
-            self._query("UPDATE accounts SET password = ? WHERE name = ?", self.passwords.hash(password, name), name)
-        try:
-            return self.begin(name, replaces)
-        except ConfigError:  # removed while the password was checked
-            raise LoginError("wrong name or password") from None
+        return str(kept)
 
     def begin(self, name: str, replaces: str | None = None) -> tuple[str, Session]:
         """A session without a password: for whoever just set theirs."""

@@ -1,0 +1,144 @@
+"""The socket /api/live: what happens goes to the page, what people do comes from it."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from typing import Any
+
+import numpy as np
+from starlette.websockets import WebSocket
+
+from tutelage.console import messages
+from tutelage.console.accounts import Role, Session
+from tutelage.console.context import log
+from tutelage.console.fleet_api import describe
+from tutelage.console.hub import Hub, state_message, waiting_for
+from tutelage.console.limits import Bucket
+from tutelage.console.plain import plain, text
+from tutelage.console.sockets import Socket, error
+from tutelage.console.supervision import Denied
+from tutelage.errors import TutelageError
+
+WAITING_MAX = 512
+"""Events that a slow page may have before it; then it is told to come back and see the newest."""
+HISTORY = 600
+
+
+class LiveSocket(Socket):
+    """One page."""
+
+    open_now: Counter[str] = Counter()
+
+    def __init__(self, websocket: WebSocket, hub: Hub, session: Session) -> None:
+        super().__init__(websocket, hub.context, session)
+        self.hub = hub
+        self._events: deque[str] = deque()
+        self._state: str | None = None
+        self._stops = Bucket(20.0, 40)
+        self._delays: deque[float] = deque(maxlen=500)
+        self._commands = self._dropped = 0
+        self._next_link = time.monotonic() + 1
+
+    # -- to the page --------------------------------------------------------------------------------------------
+
+    def tell(self, message: str) -> None:
+        if len(self._events) >= WAITING_MAX:
+            self.end(1013, "too slow; come back")
+            return
+        self._events.append(message)
+        self.wake.set()
+
+    def show(self, state: str) -> None:
+        self._state = state
+        self.wake.set()
+
+    def refuse(self, code: str, why: str, ref: int | str | None = None) -> None:
+        self.tell(error(code, why, ref))
+
+    async def send_what_waits(self) -> float | None:
+        while self._events:
+            await self.websocket.send_text(self._events.popleft())
+        if self._state is not None:
+            state, self._state = self._state, None
+            await self.websocket.send_text(state)
+        return None
+
+    async def begin(self) -> None:
+        supervision = self.context.supervision
+        no_seat = await self.hub.join(self, self.session.role >= Role.OPERATOR)
+        newest = supervision.snapshot()
+        rows = await self.context.slow.run(supervision.metrics, max(0, newest.t - 10**9))
+        me = {"name": self.name, "role": self.session.role.name.lower(), "seat": self.hub.seats.get(self.name)}
+        hello = {"type": "hello", "me": me, "fleet": describe(self.websocket.app), "metrics": plain(rows[-HISTORY:])}
+        # What was told while it joined comes after hello.
+        waiting = [text(message) for message in waiting_for(self.name, newest)]
+        self._events.extendleft(reversed([text(hello | {"server_time": time.time()}), *waiting]))
+        self.show(state_message(newest))
+        if no_seat:
+            self.refuse("no_seat", no_seat)
+
+    async def finish(self) -> None:
+        await self.hub.leave(self)
+
+    async def check(self) -> None:
+        now = time.monotonic()
+        if now < self._next_link:
+            return
+        self._next_link = now + 1
+        p50, p99 = np.percentile(self._delays, [50, 99]).tolist() if self._delays else (None, None)
+        link = {"p50": p50, "p99": p99}
+        counts = {"commands": self._commands, "dropped": self._dropped}
+        self.tell(text({"type": "link", "command_latency_ms": link, **counts}))
+
+    # -- from the page ------------------------------------------------------------------------------------------
+
+    def exempt(self, message: str) -> bool:
+        return '"estop"' in message and self._stops.take()
+
+    async def received(self, message: str) -> None:
+        began = time.perf_counter()
+        said = messages.parse_live(message)
+        if isinstance(said, messages.Ping):
+            self.tell(text({"type": "pong", "n": said.n, "time": said.time, "server_time": time.time()}))
+            return
+        if self.session.role < Role.OPERATOR:
+            self.refuse("forbidden", "viewers look only", said.ref)
+            return
+        try:
+            if isinstance(said, messages.Command):
+                self._commands += 1
+                self.context.supervision.command(
+                    self.name, said.robot, said.lease, said.seq, said.action, said.assist, said.push
+                )
+                self._delays.append(1000 * (time.perf_counter() - began))
+            elif isinstance(said, messages.Renew):
+                self.context.supervision.renew(self.name, said.lease)
+            else:
+                await self._do(said)
+                self.tell(text({"type": "ack", "ref": said.ref}))
+        except Denied as denied:
+            self._dropped += isinstance(said, messages.Command)
+            self.refuse(denied.code, denied.text, said.ref)
+        except TutelageError as problem:
+            self.refuse("held", str(problem), said.ref)
+        except Exception:
+            log.exception("what %s asked for failed", self.name)
+            self.refuse("internal", "an error of the server; its log says more", said.ref)
+
+    async def _do(self, said: Any) -> None:
+        """What may wait for a lock or for a robot, in a thread."""
+        s, run, me = self.context.supervision, self.context.control.run, self.name
+        match said:
+            case messages.OnRobot():
+                await run(getattr(s, said.type), me, said.robot)
+            case messages.HandOver():
+                await run(s.hand_over, me, said.robot, said.to)
+            case messages.Stop():
+                await run(s.estop if said.type == "estop" else s.clear_estop, me, said.robot)
+            case messages.Available():
+                if me not in self.hub.seats and said.yes:
+                    no_seat = await self.hub.sit(me)
+                    if no_seat:
+                        raise Denied("no_seat", no_seat)
+                await run(s.available, me, said.yes)
