@@ -1,0 +1,195 @@
+"""`tutelage serve`: the loop, the people and the web application in one process."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from tutelage.errors import ConfigError, MissingExtraError
+
+try:
+    import uvicorn
+except ModuleNotFoundError:
+    raise MissingExtraError("uvicorn", "console") from None
+
+from tutelage.console.accounts import Accounts
+from tutelage.console.app import create_app
+from tutelage.console.audit import Audit
+from tutelage.console.context import Context
+from tutelage.console.limits import is_loopback
+from tutelage.console.messages import LONGEST
+from tutelage.console.security import App, Site
+
+if TYPE_CHECKING:
+    from tutelage.console.supervision import Supervision
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class WebConfig:
+    """Where the console is.
+
+    Attributes:
+        host: address to listen on; others than this machine's own need a certificate and accounts.
+        port: 0: any free one.
+        certificate: PEM file of the server's certificate (and chain), for HTTPS.
+        key: PEM file of its private key.
+        origin: how browsers reach it through a proxy that you run in front of it, such as https://robots.example.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8800
+    certificate: Path | None = None
+    key: Path | None = None
+    origin: str | None = None
+
+    def site(self) -> Site:
+        """What of it the checks of requests need. Raises ConfigError where it cannot work."""
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigError("--certificate and --key are given together")
+        if not is_loopback(self.host) and self.certificate is None:
+            raise ConfigError(
+                f"{self.host} is not this machine's own address: give --certificate and --key, or use 127.0.0.1"
+            )
+        origins: tuple[str, ...] = ()
+        if self.origin is not None:
+            parts = urlsplit(self.origin)
+            if parts.scheme not in ("http", "https") or not parts.netloc or parts.path or parts.query or parts.fragment:
+                raise ConfigError(f"--origin is a scheme and a name, such as https://robots.example, not {self.origin!r}")
+            origins = (f"{parts.scheme}://{parts.netloc}",)
+        return Site(self.certificate is not None, origins)
+
+    def check_certificate(self) -> None:
+        """Raises ConfigError where certificate and key cannot be used."""
+        if self.certificate is None:
+            return
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key, password=lambda: "")
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{self.certificate} and {self.key} cannot be used: {error}") from None
+
+
+def uvicorn_config(app: App, host: str, port: int, **options: Any) -> uvicorn.Config:
+    """How the web server runs: silent clients end after 5 s, long messages are refused, nothing is believed of proxies."""
+    return uvicorn.Config(
+        app,
+        host=host,
+        port=port,
+        ws_max_size=LONGEST,
+        ws_ping_interval=2.0,
+        ws_ping_timeout=3.0,
+        ws_per_message_deflate=False,
+        proxy_headers=False,
+        server_header=False,
+        access_log=False,
+        log_config=None,
+        lifespan="on",
+        limit_concurrency=2048,
+        timeout_keep_alive=15,
+        timeout_graceful_shutdown=3,
+        **options,
+    )
+
+
+class Server(uvicorn.Server):
+    """The web server; Ctrl-C and SIGTERM end it, and what comes after it is still done."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Install the handlers, where this is the main thread, and put the ones before back."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            self.handle_exit(number, frame)
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def serve(open_supervision: Callable[[Audit], Supervision], out: Path, web: WebConfig, say: Say) -> None:
+    """Serve until Ctrl-C or SIGTERM.
+
+    Args:
+        open_supervision: makes the fleet and its loop, which take their time; it has not begun.
+        out: folder of the accounts and the record.
+        web: where.
+        say: takes lines for the person at the terminal.
+
+    Raises:
+        ConfigError: the address, the certificate or the folder cannot be used, or accounts are missing.
+    """
+    site = web.site()
+    web.check_certificate()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_only_one(out))
+        accounts = stack.enter_context(contextlib.closing(Accounts(out)))
+        invitation = accounts.invite()
+        if invitation and (not is_loopback(web.host) or site.origins):
+            raise ConfigError(f"make an account first: tutelage accounts add NAME --role admin --out {out}")
+        listening = stack.enter_context(_listen(web.host, web.port))
+        audit = stack.enter_context(contextlib.closing(Audit(out)))
+        supervision = stack.enter_context(contextlib.closing(open_supervision(audit)))
+        app = create_app(Context(supervision, accounts, audit, site))
+        files = {"ssl_certfile": web.certificate, "ssl_keyfile": web.key} if site.tls else {}
+        server = Server(uvicorn_config(app, web.host, web.port, **files))
+        supervision.start()
+        audit.write("server", "server", action="start", pid=os.getpid())
+        _greet(say, site, listening, invitation)
+        server.run(sockets=[listening])
+        say("stopping: robots hold, everything is written down")
+        audit.write("server", "server", action="stop")
+
+
+def _greet(say: Say, site: Site, listening: socket.socket, invitation: str | None) -> None:
+    host, port = listening.getsockname()[:2]
+    name = f"[{host}]" if ":" in host else host
+    address = site.origins[0] if site.origins else f"{'https' if site.tls else 'http'}://{name}:{port}"
+    if invitation:
+        say(f"console: {address}/#/setup/{invitation}")
+        say("open this link once to make the first account; it works for an hour, on this machine only")
+    else:
+        say(f"console: {address}")
+        say("open it in a browser and log in; accounts: tutelage accounts --help")
+    say("Ctrl-C ends it")
+
+
+@contextlib.contextmanager
+def _only_one(folder: Path) -> Iterator[None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = os.open(folder / "server.lock", os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise ConfigError(f"cannot use the folder {folder}: {error.strerror}") from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError:
+        raise ConfigError(f"another server uses {folder}; give another --out") from None
+    finally:
+        os.close(file)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0][0]
+        return socket.create_server((host, port), family=family, backlog=512)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"cannot listen on {host} port {port}: {getattr(error, 'strerror', None) or error}") from None
