@@ -27,12 +27,12 @@ class Latch:
         counts: messages on the lane that were dropped, by reason.
     """
 
-    def __init__(self, folder: Path | None, on_stop: Callable[[], None], on_clear: Callable[[], None]) -> None:
+    def __init__(self, folder: Path | None, on_stop: Callable[[bool], None], on_clear: Callable[[], None]) -> None:
         """
         Args:
             folder: of the robot's node; None: nothing outlasts the program.
             on_stop, on_clear: called at once, on the thread of whoever says so. on_stop is called for each message, as the
-                first call may have failed.
+                first call may have failed, and is told whether it is the first.
         """
         self.counts = Counts()
         self._file = None if folder is None else folder / FILE
@@ -69,8 +69,8 @@ class Latch:
 
     def stop(self) -> None:
         """Stop now. Also for a button on the robot itself."""
-        self._stopped = True  # before anything that may take time
-        self._on_stop()
+        first, self._stopped = not self._stopped, True  # before anything that may take time
+        self._on_stop(first)
         if self._file is not None and not self._file.exists():
             try:
                 write_atomic(self._file, b"emergency stop; the server clears it\n")
@@ -85,4 +85,4 @@ class Latch:
             self._stopped = False
             self._on_clear()
             if self._stopped:  # by a button on the robot, meanwhile
-                self._on_stop()
+                self._on_stop(True)

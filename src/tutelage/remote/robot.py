@@ -158,12 +158,12 @@ class Robot:
 
         self._number = self._episode = self._step = 0
         self._return, self._last_action = 0.0, None
-        self._executed = 0
+        self._executed = (0, 0)  # server, number
         self._held = True
         self._failing_since: float | None = None
         self._obs: Array | None = None
 
-        self._reset(None if self.config.seed is None else self.config.seed, hard=False)
+        self._reset(self.config.seed, hard=False)
         cameras = self._working_cameras()
         threaded = bool(getattr(driver, "threaded_cameras", False))
         self.eyes = Eyes(
@@ -245,28 +245,21 @@ class Robot:
                     self._news.notify_all()
         return pack_answer(known)
 
-    def _stop_now(self) -> None:
+    def _stop_now(self, first: bool) -> None:
         """On the stop lane's thread: nothing comes before this."""
         try:
             getattr(self.driver, "stop", self.driver.hold)()
         except Exception:
             log.exception("%s: the driver's emergency stop failed; it is called again", self.node.name)
-        self._say("emergency stop", self.latch.stopped)
+        if first:
+            self._report("emergency stop")
         with self._news:
             self._news.notify_all()
 
     def _released(self) -> None:
         with contextlib.suppress(Exception):
             getattr(self.driver, "release", lambda: None)()
-        self._said_stop = False
         self._report("the emergency stop is cleared")
-
-    _said_stop = False
-
-    def _say(self, line: str, stop: bool) -> None:
-        if stop and not self._said_stop:
-            self._said_stop = True
-            self._report(line)
 
     # -- the loop ----------------------------------------------------------------------------------------------------------
 
@@ -282,7 +275,7 @@ class Robot:
                 if self._obs is not None and self.gate.heard:
                     self._report(f"holds: no fresh command for {self.config.watchdog:g} s")
                 return
-            new = command is not None and command.number != executed
+            new = command is not None and (command.server, command.number) != executed
             due = began + self._dt * (LATE if command is not None and not new and not self._over() else EARLY if new else 1.0)
             until = min(due, self.gate.until) if not self._held else due
             with self._news:
@@ -315,7 +308,8 @@ class Robot:
 
     def _act(self) -> None:
         command = self.gate.current(time.monotonic())
-        self._executed = command.number if command is not None else self._executed
+        if command is not None:
+            self._executed = command.server, command.number
         if self.latch.stopped:
             getattr(self.driver, "stop", self.driver.hold)()
             self._held, self._last_action = True, None
@@ -361,7 +355,7 @@ class Robot:
         """Begin an episode: at the start of the program, or when the server asks."""
         self._hold()
         reset = getattr(self.driver, "reset", None)
-        if reset is not None:
+        if reset is not None and not self.latch.stopped:
             reset(hard, seed)
         self._episode += 1
         self._step, self._return = 0, 0.0
@@ -410,7 +404,7 @@ class Robot:
             heard = bool(self.gate.heard)
             message = Observation(
                 self.boot, self._number, self._episode, self._step, flags, self.gate.server, self.gate.heard,
-                0 if self._held else self._executed, now - self.gate.heard_at if heard else 0.0, self._return,
+                self._executed[1] if self._executed[0] == self.gate.server else 0, now - self.gate.heard_at if heard else 0.0, self._return,
                 self.gate.counts["stale"], self.gate.counts.total() - self.gate.counts["stale"] + self.latch.counts.total(),
                 version, self._obs, proposal,
             )  # fmt: skip

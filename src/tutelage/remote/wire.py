@@ -114,7 +114,7 @@ class Observation:
         step: timesteps of the episode so far.
         flags: the robot's state.
         server, heard: start and number of the newest command that arrived, whether it was executed or not; 0: none.
-        executed: number of the command that was executed in this step; 0: none, the robot was held.
+        executed: number of the newest command of that start that decided what the robot does, moving or holding; 0: none.
         waited: seconds from the arrival of that command to the sending of this, on the robot's clock.
         episode_return: sum of the rewards of the episode.
         stale, refused: commands that came too late, and messages that were no commands for this robot; since the start.

@@ -1,0 +1,155 @@
+"""Robots on the network: new, policy, status."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from tutelage.errors import ConfigError
+
+DRIVER_FAILED = 3
+"""Exit status of `tutelage robot` when the driver goes on failing: whoever started it may start it again."""
+
+
+def robot(
+    home: Positional[Path],
+    env: str,
+    hz: float = 10.0,
+    watchdog: float = 0.5,
+    slew: float | None = None,
+    cameras: bool = True,
+    camera_hz: float = 10.0,
+    size: tuple[int, int] = (320, 240),
+    quality: int = 80,
+    seed: int | None = None,
+    policy: bool = False,
+    health: str | None = None,
+) -> None:
+    """Put a robot on the fleet: a driver of yours, any Gymnasium environment, or a task of ours. Ctrl-C ends it.
+
+    It holds whenever no fresh command is there, and whatever happens to the network or the server it comes back by itself.
+    Exit status: 0 when it was told to end, 2 if something is set up wrong, 3 if the driver goes on failing.
+
+    Args:
+        home: the folder of the robot's node (tutelage keys, tutelage fleet new).
+        env: module:callable that makes a driver, an environment or a fleet of one; a task such as Navigation; or the id of a
+            Gymnasium environment.
+        hz: timesteps in a second.
+        watchdog: seconds; the robot holds when the observation that the newest command answers is older than that.
+        slew: largest change of an action in a second, as a fraction of its range; default: no limit.
+        cameras: send pictures of what is watched.
+        camera_hz: pictures of a camera in a second, at most.
+        size: of pictures that a task of ours draws, width and height.
+        quality: of the pictures' JPEG, 1 to 100.
+        seed: of the first episode.
+        policy: decide on the robot, with weights that the server hands out; the server overrides.
+        health: HOST:PORT at which to serve /healthz and /metrics.
+    """
+    from tutelage.remote.driver import make_driver
+    from tutelage.remote.robot import DriverFailed, Robot, RobotConfig
+    from tutelage.sgc.commands.stopping import until_stopped
+    from tutelage.sgc.health import HealthServer, node_health
+    from tutelage.sgc.node import Node
+
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    config = RobotConfig(hz, watchdog, slew, camera_hz, quality, seed)
+    if min(size) < 16 or max(size) > 4096:
+        raise ConfigError(f"pictures are 16 to 4096 pixels wide and high, not {size[0]} x {size[1]}")
+    with contextlib.ExitStack() as stack:
+        stop = stack.enter_context(until_stopped())
+        node = stack.enter_context(Node.open(home))
+        driver = make_driver(env, render=cameras, size=size)
+        stack.callback(getattr(driver, "close", lambda: None))
+        own = None
+        if policy:
+            from tutelage.remote.weights import PulledPolicy
+
+            own = stack.enter_context(PulledPolicy(node))
+        running = stack.enter_context(Robot(node, driver, config, lambda line: print(f"{node.name}: {line}", flush=True), own))
+        if health is not None:
+            stack.enter_context(
+                HealthServer(health, lambda: node_health(node), lambda: {**node.counters(), "robot": running.counters})
+            )
+        seen = ", ".join(running.eyes.names)
+        print(f"{node.name}: {env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it", flush=True)
+        try:
+            running.run(stop)
+        except DriverFailed as error:
+            print(f"tutelage: {error}", file=sys.stderr)
+            raise SystemExit(DRIVER_FAILED) from None
+        print(f"{node.name}: ended", flush=True)
+
+
+def new(
+    folder: Positional[Path],
+    robots: int = 4,
+    connect: str = "tls/127.0.0.1:7447",
+    cameras: tuple[str, ...] = ("front",),
+    name: str = "fleet",
+    hours: float = 24.0,
+) -> None:
+    """Keys, policy and folders of a whole fleet on this machine, to try things out.
+
+    Args:
+        folder: empty, or not there yet.
+        robots: how many; they are called robot-1, robot-2, ...
+        connect: where the router will be reached.
+        cameras: names of each robot's cameras.
+        name: of the fleet.
+        hours: validity of the certificates.
+    """
+    from tutelage.remote.setup import new_fleet
+
+    if not 1 <= robots <= 10_000:
+        raise ConfigError(f"a fleet has 1 to 10,000 robots, not {robots}")
+    made = new_fleet(folder, robots, connect=connect, cameras=cameras, name=name, hours=hours)
+    port = connect.rpartition(":")[2]
+    protocol = connect.partition("/")[0]
+    print(f"a fleet of {robots} robots in {folder}; start it with:")
+    print(f"    tutelage router {made.router} --listen {protocol}/0.0.0.0:{port}")
+    print(f"    tutelage robot {made.robots[0]} --env Navigation")
+    print(f"    tutelage fleet status {made.server}")
+
+
+def policy(
+    robots: Positional[tuple[str, ...]],
+    server: str = "server",
+    cameras: tuple[str, ...] = ("front",),
+) -> None:
+    """Print policy.toml for a fleet whose robots make their own keys.
+
+    Args:
+        robots: names of the robots' nodes.
+        server: name of the server's node.
+        cameras: names of each robot's cameras.
+    """
+    from tutelage.remote.topics import fleet_policy
+
+    print(fleet_policy(robots, server, cameras), end="")
+
+
+def status(home: Positional[Path], seconds: float = 3.0) -> None:
+    """Who is there, as the server sees it: listens and commands nothing. Not while a server runs with this folder.
+
+    Args:
+        home: the folder of the server's node.
+        seconds: how long to listen.
+    """
+    from tutelage.remote.fleet import RemoteFleet
+
+    with contextlib.closing(RemoteFleet.connect(home, wait=max(seconds, 1.0))) as fleet:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until and not all(row["state"] == "online" for row in fleet.status()):
+            time.sleep(0.05)
+        for row in fleet.status():
+            age = "" if row["age"] is None else f"heard {row['age']:.2f} s ago, episode {row['episode']}, step {row['step']}"
+            print(f"{row['name']:<24} {row['state']:<10} {age} {row['says']}".rstrip())
+
+
+VERBS: dict[str, Callable[..., None]] = {"new": new, "policy": policy, "status": status}

@@ -1,0 +1,551 @@
+"""All robots of a fleet network as one `Fleet`: real time, robots that come, lag, vanish, and start again elsewhere.
+
+    with RemoteFleet.connect(Path("server")) as fleet:
+        loop = Loop(fleet, policy, ...)
+
+The slots are the robots that the policy of the fleet network names, whether they are there or not. Each step sends a command
+to every robot in reach, sleeps to the next tick, and gives each robot's newest observation. `info["online"]` says who is in
+reach: whoever sent something within the deadline, is what the fleet consists of, is not stopped, and is not being reset.
+A reset goes on while the loop does: the robot is out of reach until the first observation of its new episode.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from tutelage.errors import ConfigError, ContractError, TutelageError
+from tutelage.files import write_atomic
+from tutelage.fleet.fleet import Fleet, Mask
+from tutelage.remote import topics
+from tutelage.remote.jpeg import decode
+from tutelage.remote.slot import Slot
+from tutelage.remote.wire import (
+    Ask,
+    Command,
+    Description,
+    Flag,
+    Malformed,
+    Operation,
+    Order,
+    Stop,
+    StopOperation,
+    pack_ask,
+    pack_command,
+    pack_stop,
+    unpack_answer,
+    unpack_description,
+)
+from tutelage.sgc.messages import Message
+from tutelage.sgc.node import Node
+from tutelage.sgc.workers import Workers
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[Any]
+
+FILE = "fleet.json"
+"""In the server's folder: what the robots are, so that a server that starts again need not wait for one of them."""
+
+TEND = 0.05
+ASK_AGAIN = 0.3
+STOP_AGAIN = 0.1
+"""Seconds between two looks at what is owed to the robots, two requests to one, two messages of the emergency stop."""
+
+ANSWER = 3.0
+"""Seconds for which a robot's answer is waited for."""
+
+
+class RemoteFleet(Fleet):
+    """N robots on a network; see `Fleet` for the contract.
+
+    * Robots outside `active`, and those out of reach, hold.
+    * The first `reset` resets nobody: robots go on with the episodes that they are in. Later ones ask for a hard reset where
+      a robot is in violation or its episode has not ended, for a soft one otherwise.
+    * It cannot be checkpointed: the world has no state that could be restored.
+
+    Attributes:
+        names: of the robots, (N,).
+        description: what each of them is.
+        server: 64 random bits of this start.
+        late: seconds by which the last step missed its tick.
+    """
+
+    can_checkpoint = False
+
+    def __init__(
+        self,
+        node: Node,
+        robots: Sequence[str] | None = None,
+        *,
+        hz: float | None = 10.0,
+        deadline: float = 0.5,
+        wait: float = 30.0,
+        description: Description | None = None,
+        own_node: bool = False,
+    ) -> None:
+        """
+        Args:
+            node: the server's.
+            robots: which of those that the policy names; default: all.
+            hz: steps in a second. None: a step ends as soon as every robot in reach has answered it, at most `deadline`.
+            deadline: seconds without an observation after which a robot is out of reach; at least three of its timesteps.
+            wait: seconds to wait for a first robot, where it is not known yet what the robots are.
+            description: what they are; default: what the last server knew, or else the first robot says.
+            own_node: close the node in the end.
+
+        Raises:
+            ConfigError: no robots in the policy, or none that answers.
+        """
+        known = topics.robots_in(set(node.access.topics))
+        self.names = known if robots is None else tuple(robots)
+        if missing := sorted(set(self.names) - set(known)):
+            raise ConfigError(f"the policy has no robot {missing[0]}; it has {', '.join(known) or 'none'}")
+        if not self.names:
+            raise ConfigError(
+                f"the policy lets {node.name} drive no robot; write one with: tutelage fleet policy ROBOT... --server {node.name}"
+            )
+        if hz is not None and not 0.1 <= hz <= 1000:
+            raise ConfigError(f"a fleet's rate is 0.1 to 1000 Hz, not {hz:g}")
+        if not deadline > 0:
+            raise ConfigError(f"the deadline must be more than 0 seconds, not {deadline:g}")
+        self.node, self.num_envs, self.hz, self._deadline = node, len(self.names), hz, deadline
+        self.server = secrets.randbits(64) | 1
+        self.late = 0.0
+        self.metadata = {**self.metadata, "render_fps": round(hz or 10)}
+        self._own_node = own_node
+        self._slots = [Slot(name) for name in self.names]
+        self._news = threading.Condition()
+        self._closed = threading.Event()
+        self._pool = Workers("fleet-ask", 8, 4 * self.num_envs + 64)
+        self._number = self._asks = self._stops = 0
+        self._tick = float("-inf")
+        self._active: Mask = np.zeros(self.num_envs, dtype=bool)
+        self._started = False
+        self._file = node.home.path / FILE
+        self._description: Description | None = description or self._remembered()
+        self._commands = [node.publisher(topics.alias(name, topics.COMMAND)) for name in self.names]
+        self._stop_lanes = [node.publisher(topics.alias(name, topics.STOP)) for name in self.names]
+        self._subscriptions = []
+        for slot in self._slots:
+            seen = topics.alias(slot.name, topics.OBSERVATION)
+            self._subscriptions.append(node.subscribe(seen, partial(self._on_observation, slot)))
+            for camera in topics.cameras_in(slot.name, set(node.access.topics)):
+                lane = topics.alias(slot.name, topics.PICTURE, camera)
+                self._subscriptions.append(node.subscribe(lane, partial(self._on_picture, slot, camera)))
+        self._tending = threading.Thread(target=self._tend, name="fleet-tend", daemon=True)
+        self._tending.start()
+        try:
+            self._learn_what_robots_are(wait)
+        except BaseException:
+            self.close()
+            raise
+        self._obs = np.zeros((self.num_envs, *self.description.shape), np.dtype(self.description.dtype))
+
+    @classmethod
+    def connect(cls, home: Path, robots: Sequence[str] | None = None, **settings: Any) -> RemoteFleet:
+        """A fleet with a node of its own.
+
+        Args:
+            home: the server's folder (`tutelage keys`).
+            settings: see `__init__`.
+
+        Raises:
+            KeysError, NotIssued, ConfigError: the folder cannot be used, or no robot answers.
+        """
+        node = Node.open(home)
+        try:
+            return cls(node, robots, own_node=True, **settings)
+        except BaseException:
+            node.close()
+            raise
+
+    @property
+    def description(self) -> Description:
+        """What each robot is."""
+        assert self._description is not None
+        return self._description
+
+    @property
+    def deadline(self) -> float:
+        """Seconds without an observation after which a robot is out of reach."""
+        return max(self._deadline, 3 * self._description.dt) if self._description is not None else self._deadline
+
+    # -- the fleet ---------------------------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Ask the robots of `options["reset_mask"]` for a new episode; see the class. Returns at once."""
+        mask = self.reset_mask(options)
+        with self._news:
+            if self._started:
+                for i in np.flatnonzero(mask):
+                    self._want_reset(self._slots[i], None if seed is None else seed + int(i))
+            self._started = True
+            return self._obs.copy(), self._info(np.zeros(self.num_envs, dtype=bool))
+
+    def step_async(self, actions: Array, active: Mask | None = None) -> None:
+        if not self._started:
+            raise ContractError("reset the fleet before its first step")
+        actions = np.asarray(actions, dtype=np.float32)
+        now = time.monotonic()
+        with self._news:
+            online = self._online(now)
+            moving = online if active is None else online & active
+            self.check_actions(actions, moving)
+            self._active, self._number = moving, self._number + 1
+            orders = [self._order(i, actions[i], bool(moving[i]), now) for i in range(self.num_envs)]
+        for publisher, order in zip(self._commands, orders, strict=True):
+            if order is not None:
+                self._send(lambda publisher=publisher, order=order: publisher.send(order))
+
+    def step_wait(self) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
+        self._wait()
+        n = self.num_envs
+        reward, success, truncated = np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        with self._news:
+            obs = self._obs.copy()
+            now = time.monotonic()
+            states = self._states(now)
+            for i, slot in enumerate(self._slots):
+                seen, before = slot.newest, slot.delivered
+                if states[i] != "online" or seen is None:
+                    continue
+                same = before is not None and (before.boot, before.episode) == (seen.boot, seen.episode)
+                if slot.was_online and not same:
+                    states[i] = "restarted"  # out of reach for one step, so that no one takes two episodes for one
+                    continue
+                if same and before is not None and self._active[i]:
+                    reward[i] = seen.episode_return - before.episode_return
+                    violated = bool(seen.flags & Flag.VIOLATION)
+                    success[i] = bool(seen.flags & Flag.SUCCESS) and not violated
+                    over = bool(seen.flags & Flag.TRUNCATED) or seen.step >= self.horizon
+                    truncated[i] = over and not violated
+                slot.delivered = seen
+                obs[i] = seen.obs
+            self._obs = obs
+            info = self._info(success, states)
+            for slot, online in zip(self._slots, info["online"], strict=True):
+                slot.was_online = bool(online)
+        return obs.copy(), reward, info["violation"], truncated, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Leave the topics; robots hold."""
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        with self._news:
+            self._news.notify_all()
+        for subscription in self._subscriptions:
+            subscription.close()
+        for publisher in (*self._commands, *self._stop_lanes):
+            publisher.close()
+        self._pool.close()
+        self._tending.join(2.0)
+        if self._own_node:
+            self.node.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        raise ConfigError("a fleet of real robots cannot be checkpointed: the world has no state that could be restored")
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        raise ConfigError("a fleet of real robots cannot be checkpointed: the world has no state that could be restored")
+
+    # -- emergency stop, pictures, what there is to know; from any thread ----------------------------------------------------
+
+    def stop(self, robot: int | None = None) -> None:
+        """Emergency stop of a robot, or of all: sent at once, on a lane of its own, until the robot shows it.
+
+        A robot that cannot be reached now is stopped when it comes back.
+        """
+        for i in range(self.num_envs) if robot is None else (robot,):
+            slot = self._slots[i]
+            with self._news:
+                slot.stop, slot.clear = True, False
+            self._send_stop(i, StopOperation.STOP)
+
+    def clear(self, robot: int | None = None) -> None:
+        """End the emergency stop of a robot, or of all."""
+        for i in range(self.num_envs) if robot is None else (robot,):
+            slot = self._slots[i]
+            with self._news:
+                if not slot.stopped:
+                    continue
+                slot.stop, slot.clear = False, True
+            self._send_stop(i, StopOperation.CLEAR)
+
+    def picture(self, robot: int, camera: int = 0) -> tuple[float, NDArray[np.uint8]] | None:
+        """The newest picture of a robot's camera: when it came (seconds since 1970), and (H, W, 3) uint8.
+
+        Robots send pictures only of cameras that somebody looks at: the first call for a while gives None.
+        """
+        found = self.jpeg(robot, camera)
+        if found is None:
+            return None
+        try:
+            return found[0], decode(found[1])
+        except Malformed:
+            self._slots[robot].counts.add("malformed")
+            return None
+
+    def jpeg(self, robot: int, camera: int = 0) -> tuple[float, bytes] | None:
+        """As `picture`, compressed as it came."""
+        slot = self._slots[robot]
+        with self._news:
+            slot.watch(camera, time.monotonic())
+            found = slot.pictures.get(camera)
+        return None if found is None else (found[0], found[1].jpeg)
+
+    def status(self) -> list[dict[str, Any]]:
+        """Of each robot: name, state (never, gone, misfit, asking, stopped, resetting, fault, online), seconds since it was
+        heard, round trip in seconds, episode, step, starts, what it and we refused, and what there is to say."""
+        now = time.monotonic()
+        with self._news:
+            rows = []
+            for slot in self._slots:
+                seen = slot.newest
+                rows.append(
+                    {
+                        "name": slot.name,
+                        "state": slot.state(now, self.deadline),
+                        "age": now - slot.heard_at if seen is not None else None,
+                        "round_trip": None if np.isnan(slot.round_trip) else slot.round_trip,
+                        "episode": seen.episode if seen is not None else 0,
+                        "step": seen.step if seen is not None else 0,
+                        "held": slot.has(Flag.HELD),
+                        "starts": slot.starts,
+                        "stale": seen.stale if seen is not None else 0,
+                        "refused_there": seen.refused if seen is not None else 0,
+                        "refused_here": dict(slot.counts.by_reason),
+                        "says": slot.misfit,
+                    }
+                )
+            return rows
+
+    def refused(self) -> dict[str, int]:
+        """What was dropped, by reason: by this fleet, and by the network as not genuine."""
+        total: dict[str, int] = {}
+        with self._news:
+            for slot in self._slots:
+                for reason, count in slot.counts.by_reason.items():
+                    total[reason] = total.get(reason, 0) + count
+        for subscription in self._subscriptions:
+            for reason, count in subscription.opener.refusals.as_dict().items():
+                total[f"network_{reason}"] = total.get(f"network_{reason}", 0) + count
+        return total
+
+    # -- on the network's threads --------------------------------------------------------------------------------------------
+
+    def _on_observation(self, slot: Slot, message: Message) -> None:
+        now = time.monotonic()
+        with self._news:
+            if slot.observe(message.payload, self._description, self.server, now):
+                self._news.notify_all()
+
+    def _on_picture(self, slot: Slot, camera: str, message: Message) -> None:
+        with self._news:
+            names = slot.description.cameras if slot.description is not None else ()
+            if camera in names:
+                slot.look(message.payload, names.index(camera), message.received)
+            else:
+                slot.counts.add("camera")
+
+    # -- with the lock held --------------------------------------------------------------------------------------------------
+
+    def _states(self, now: float) -> list[str]:
+        return [slot.state(now, self.deadline) for slot in self._slots]
+
+    def _online(self, now: float) -> Mask:
+        """Those that the loop was told are in reach, and still are."""
+        return np.array(
+            [slot.was_online and state == "online" for slot, state in zip(self._slots, self._states(now), strict=True)]
+        )
+
+    def _info(self, success: Mask, states: list[str] | None = None) -> dict[str, Any]:
+        if states is None:
+            found = self._states(time.monotonic())
+            states = [s if slot.was_online or s != "online" else "new" for slot, s in zip(self._slots, found, strict=True)]
+        given = [slot.delivered for slot in self._slots]
+        return {
+            "online": np.array([state == "online" for state in states]),
+            "violation": np.array([slot.has(Flag.VIOLATION) and not slot.reset for slot in self._slots]),
+            "success": success,
+            "stopped": np.array([slot.stopped for slot in self._slots]),
+            "resetting": np.array([bool(slot.reset) or slot.has(Flag.RESETTING) for slot in self._slots]),
+            "held": np.array([slot.has(Flag.HELD) for slot in self._slots]),
+            "elapsed": np.array([seen.step if seen is not None else 0 for seen in given]),
+            "return": np.array([seen.episode_return if seen is not None else 0.0 for seen in given]),
+        }
+
+    def _want_reset(self, slot: Slot, seed: int | None) -> None:
+        ended = slot.has(Flag.SUCCESS) or slot.has(Flag.TRUNCATED)
+        ended |= slot.delivered is not None and slot.delivered.step >= self.horizon
+        self._asks += 1
+        slot.reset = "soft" if ended and not slot.has(Flag.VIOLATION) else "hard"
+        slot.seed, slot.reset_number, slot.accepted, slot.ask_at = seed, self._asks, None, float("-inf")
+        slot.was_online = False
+        self._news.notify_all()
+
+    def _order(self, i: int, action: Array, moving: bool, now: float) -> bytes | None:
+        slot = self._slots[i]
+        seen = slot.delivered if moving else slot.newest
+        if seen is None or slot.newest is None or now - slot.heard_at > self.deadline:
+            return None
+        period = 1.0 / self.hz if self.hz else 0.0
+        order, what = (Order.ACT, action) if moving else (Order(0), action[:0])
+        slot.sent(self._number, now)
+        watch = slot.watched(now)
+        return pack_command(Command(self.server, self._number, seen.boot, seen.number, order, watch, period, what))
+
+    # -- without it ------------------------------------------------------------------------------------------------------------
+
+    def _wait(self) -> None:
+        if self.hz is None:
+            with self._news:
+                self._news.wait_for(self._all_answered, self.deadline)
+            return
+        period, now = 1.0 / self.hz, time.monotonic()
+        if self._tick < now - period:  # the first step, or the loop took longer than a tick: begin to count anew
+            self.late = now - self._tick - period if self._tick > float("-inf") else 0.0
+            self._tick = now if self.late == 0.0 else now - period
+        else:
+            self.late = 0.0
+        self._tick += period
+        self._closed.wait(max(0.0, self._tick - now))
+
+    def _all_answered(self) -> bool:
+        now = time.monotonic()
+        for slot, state in zip(self._slots, self._states(now), strict=True):
+            seen = slot.newest
+            if state == "online" and slot.was_online and seen is not None and seen.boot == getattr(slot.delivered, "boot", 0):
+                if seen.server != self.server or seen.executed < self._number:
+                    return False
+        return True
+
+    def _send(self, send: Callable[[], None]) -> None:
+        """The network may not take it (no certificate any more, closed): robots then hold by themselves."""
+        try:
+            send()
+        except TutelageError as error:
+            log.warning("%s: %s", self.node.name, error)
+
+    def _send_stop(self, i: int, operation: StopOperation) -> None:
+        with self._news:
+            self._stops += 1
+            message = pack_stop(Stop(self.server, self._stops, operation))
+            self._slots[i].stop_at = time.monotonic()
+        self._send(lambda: self._stop_lanes[i].send(message))
+
+    def _tend(self) -> None:
+        """What is owed to robots: stops that they do not show yet, resets, and a question who they are."""
+        while not self._closed.is_set():
+            now = time.monotonic()
+            due: list[tuple[int, StopOperation]] = []
+            with self._news:
+                for i, slot in enumerate(self._slots):
+                    here = slot.newest is not None and now - slot.heard_at < self.deadline
+                    if now - slot.stop_at >= STOP_AGAIN and here:
+                        if slot.stop and not slot.has(Flag.STOPPED):
+                            due.append((i, StopOperation.STOP))
+                        elif slot.clear:
+                            due.append((i, StopOperation.CLEAR))
+                    wanted = slot.description is None or (slot.reset and slot.accepted is None and not slot.stopped)
+                    if here and wanted and not slot.asking and now >= slot.ask_at and not slot.misfit:
+                        slot.asking = self._pool.submit(self._ask, slot)
+            for i, operation in due:
+                self._send_stop(i, operation)
+            self._closed.wait(TEND)
+
+    def _ask(self, slot: Slot) -> None:
+        """On the pool: who are you, or please reset."""
+        try:
+            if slot.description is None:
+                self._ask_description(slot)
+            else:
+                self._ask_reset(slot)
+        except TutelageError as error:
+            log.info("%s: %s", slot.name, error)
+        finally:
+            with self._news:
+                slot.asking, slot.ask_at = False, time.monotonic() + ASK_AGAIN
+                self._news.notify_all()
+
+    def _ask_description(self, slot: Slot) -> None:
+        boot = slot.newest.boot if slot.newest is not None else 0
+        with self._news:
+            self._asks += 1
+            ask = pack_ask(Ask(self.server, self._asks, Operation.DESCRIBE))
+        said = unpack_description(self.node.request(topics.alias(slot.name, topics.SERVICE), ask, ANSWER))
+        with self._news:
+            if slot.newest is None or slot.newest.boot != boot:
+                return  # it has started again meanwhile, and is asked again
+            if self._description is None:
+                self._description = said
+                write_atomic(self._file, (json.dumps(said.to_json(), indent=1) + "\n").encode())
+            if said.matches(self._description):
+                slot.description = said
+            else:
+                slot.misfit = _difference(said, self._description)
+                log.warning(
+                    "%s does not fit into this fleet: %s; if the fleet is another one now, remove %s",
+                    slot.name, slot.misfit, self._file,
+                )  # fmt: skip
+
+    def _ask_reset(self, slot: Slot) -> None:
+        with self._news:
+            number = slot.reset_number
+            operation = Operation.HARD_RESET if slot.reset == "hard" else Operation.SOFT_RESET
+            ask = pack_ask(Ask(self.server, number, operation, slot.seed))
+        answer = unpack_answer(self.node.request(topics.alias(slot.name, topics.SERVICE), ask, ANSWER))
+        with self._news:
+            if answer.accepted and slot.reset_number == number:
+                slot.accepted = answer
+                seen = slot.newest  # it may have been quicker than its answer
+                if seen is not None and not seen.flags & Flag.RESETTING:
+                    if seen.boot != answer.boot or seen.episode > answer.episode:
+                        slot.reset, slot.accepted = "", None
+
+    def _remembered(self) -> Description | None:
+        try:
+            return Description.from_json(json.loads(self._file.read_text(encoding="utf-8")))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, Malformed) as error:
+            log.warning("%s is of no use (%s); the first robot says what robots are", self._file, error)
+            return None
+
+    def _learn_what_robots_are(self, wait: float) -> None:
+        with self._news:
+            found = self._news.wait_for(lambda: self._description is not None, wait)
+        if not found:
+            raise ConfigError(
+                f"no robot of {', '.join(self.names[:5])}{' ...' if self.num_envs > 5 else ''} answered within {wait:g} s; "
+                "start one: tutelage robot HOME --env TASK"
+            )
+        d = self.description
+        self.horizon, self.goal_conditioned = d.horizon, d.goal
+        low, high = (0, 255) if d.dtype == "uint8" else (-np.inf, np.inf)
+        self.single_observation_space = gym.spaces.Box(low, high, d.shape, dtype=np.dtype(d.dtype).type)
+        self.single_action_space = gym.spaces.Box(
+            np.array(d.action_low, np.float32), np.array(d.action_high, np.float32), dtype=np.float32
+        )
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+
+def _difference(one: Description, other: Description) -> str:
+    for name in ("task", "shape", "dtype", "action_low", "action_high"):
+        if getattr(one, name) != getattr(other, name):
+            return f"{name} {getattr(one, name)!r}, and the fleet has {getattr(other, name)!r}"
+    return ""
