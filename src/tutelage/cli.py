@@ -21,7 +21,11 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from tutelage import __version__
+from tutelage.console.commands import accounts, audit
+from tutelage.console.commands.serve import serve
 from tutelage.errors import ConfigError, TutelageError
+from tutelage.remote import commands as fleet
+from tutelage.remote.commands import robot
 from tutelage.sgc.commands import keys, proxy
 from tutelage.sgc.commands.ping import ping
 from tutelage.sgc.commands.router import router
@@ -168,7 +172,7 @@ def watch(config: Annotated[WatchConfig, arg(name="")]) -> None:
 
 
 def check(
-    kind: Positional[Literal["env", "policy", "priority", "supervisor"]],
+    kind: Positional[Literal["env", "policy", "priority", "supervisor", "driver"]],
     name: Positional[str],
     task: str = "Walker2d",
 ) -> None:
@@ -177,9 +181,16 @@ def check(
     Args:
         kind: what it is.
         name: module:callable that makes it; an env is made as callable(num_envs), the others without arguments. For
-            env also the name of a task, for priority also a string such as C.U.R.
+            env also the name of a task, for priority also a string such as C.U.R., for driver all that `tutelage robot`
+            takes. A driver's robot moves!
         task: the fleet on which policies, priorities and supervisors are tried.
     """
+    if kind == "driver":
+        from tutelage.remote.driver import check_driver, make_driver
+
+        check_driver(make_driver(name))
+        console.print(f"{name} keeps the contract of a driver", highlight=False)
+        return
     from tutelage import checks
     from tutelage.envs.registry import load_object, make_fleet
     from tutelage.fleet.priority import parse
@@ -314,8 +325,10 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # so that module:callable finds a file of the user's in the present folder
     try:
-        connectivity = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
-        verbs = connectivity if arguments[:1] and arguments[0] in connectivity else _learning_verbs() | connectivity
+        # These do without the learning libraries, or load them when they run.
+        light = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
+        light |= {"serve": serve, "accounts": accounts, "audit": audit}
+        verbs = light if arguments[:1] and arguments[0] in light else _learning_verbs() | light
         _parse(verbs, arguments)()
         sys.stdout.flush()
     except TutelageError as error:

@@ -67,7 +67,7 @@ class Running:
 
     def cookie(self, name: str) -> str:
         """The session cookie of a new session."""
-        with self.client(name) as client:
+        with contextlib.closing(self.client(name)) as client:
             return f"tutelage_session={client.cookies['tutelage_session']}"
 
     @contextlib.contextmanager

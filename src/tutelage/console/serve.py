@@ -71,8 +71,9 @@ class WebConfig:
             origins = (f"{parts.scheme}://{parts.netloc}",)
         return Site(self.certificate is not None, origins)
 
-    def check_certificate(self) -> None:
-        """Raises ConfigError where certificate and key cannot be used."""
+    def check(self) -> None:
+        """Raises ConfigError where it cannot work, or certificate and key cannot be used."""
+        self.site()
         if self.certificate is None:
             return
         try:
@@ -136,8 +137,8 @@ def serve(open_supervision: Callable[[Audit], Supervision], out: Path, web: WebC
     Raises:
         ConfigError: the address, the certificate or the folder cannot be used, or accounts are missing.
     """
+    web.check()
     site = web.site()
-    web.check_certificate()
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_one(out))
         accounts = stack.enter_context(contextlib.closing(Accounts(out)))
