@@ -19,6 +19,7 @@ from tutelage.fleet.priority import TERMS
 from tutelage.learning.critic import CriticConfig
 from tutelage.policies.networks import hidden_layers
 from tutelage.policies.vision import HEAD
+from tutelage.remote import commands as fleet
 from tutelage.sgc.commands import keys, proxy
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,7 +27,7 @@ PAGES = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "results").glob("*.md")],
 )
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
-GROUPS = {"keys": keys, "proxy": proxy}
+GROUPS = {"keys": keys, "proxy": proxy, "fleet": fleet}
 GENERATED = {"runs", "site", "dist"}
 
 

@@ -24,7 +24,7 @@ from tutelage import __version__
 from tutelage.console.commands import accounts, audit
 from tutelage.console.commands.serve import serve
 from tutelage.errors import ConfigError, TutelageError
-from tutelage.remote import commands as fleet
+from tutelage.remote import commands as remote
 from tutelage.remote.commands import robot
 from tutelage.sgc.commands import keys, proxy
 from tutelage.sgc.commands.ping import ping
@@ -327,7 +327,7 @@ def main(args: Sequence[str] | None = None) -> None:
     try:
         # These do without the learning libraries, or load them when they run.
         light = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
-        light |= {"serve": serve, "accounts": accounts, "audit": audit}
+        light |= {"serve": serve, "accounts": accounts, "audit": audit, "robot": robot, "fleet": remote}
         verbs = light if arguments[:1] and arguments[0] in light else _learning_verbs() | light
         _parse(verbs, arguments)()
         sys.stdout.flush()
