@@ -126,7 +126,9 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
 
 
 def reproduce(
-    what: Positional[Literal["figure-2.3", "figure-A.1", "table-3.1", "table-3.3", "gates", "figure-5.3", "figure-C.1"]],
+    what: Positional[
+        Literal["figure-2.3", "figure-A.1", "table-3.1", "table-3.2", "table-3.3", "gates", "figure-5.3", "figure-C.1"]
+    ],
     tasks: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
     full: bool = False,

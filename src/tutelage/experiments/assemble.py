@@ -57,27 +57,37 @@ class Assembly:
         """The algorithmic human of this fleet; where there are kinds, all of them, see `Kinds`."""
         return PolicySupervisor(self.actor, self.fleet)
 
-    def loop(self, frozen: Policy | None = None) -> Loop:
+    def loop(self, frozen: Policy | None = None, **changes: Any) -> Loop:
         """The loop over these parts; thresholds must be resolved.
 
-        frozen: act with this policy instead, and learn nothing: an evaluation, on random streams that training never uses.
+        Args:
+            frozen: act with this policy instead, and learn nothing: an evaluation, on random streams that training never
+                uses.
+            changes: arguments of `Loop` in place of those of the run, such as a team of people.
         """
         c = self.config
         priority = parse(c.priority, c.thresholds, c.gate)
         if "goal" in priority.needs and not self.fleet.goal_conditioned:
             raise ConfigError(f"{c.priority} needs a task with a goal, and {c.task} has none; use C.U.R. or U.C.")
-        kinds = self._supervisors()
-        team = Team([kinds[j % len(kinds)] for j in range(c.humans)], c.latency)
-        omega = (FirstComeFirstServed if c.queue == "fifo" else FleetDAgger)(c.t_teleop, c.t_reset)
-        signals = self._signals()
+        queue = FirstComeFirstServed if c.queue == "fifo" else FleetDAgger
+        parts: dict[str, Any] = {
+            "fleet": self.fleet, "policy": self.policy, "priority": priority, "learner": self.learner,
+            "allocator": queue(c.t_teleop, c.t_reset), "execution": self._execution(priority),
+            "overlap": c.overlap, "wait": c.wait, "seed": c.seed,
+        }  # fmt: skip
         if frozen is not None:
-            return Loop(
-                self.fleet, frozen, priority, team, omega, signals=signals, wait=c.wait, seed=derive(c.seed, "evaluation")
-            )
-        return Loop(
-            self.fleet, self.policy, priority, team, omega, self.learner, signals,
-            execution=self._execution(priority), overlap=c.overlap, wait=c.wait, seed=c.seed,
-        )  # fmt: skip
+            parts |= {"policy": frozen, "learner": None, "execution": None, "overlap": False}
+            parts["seed"] = derive(c.seed, "evaluation")
+        parts |= changes
+        for name, make in (("team", self.team), ("signals", self.signals)):
+            if name not in parts:
+                parts[name] = make()
+        return Loop(**parts)
+
+    def team(self) -> Team:
+        """The M algorithmic humans."""
+        kinds = self._supervisors()
+        return Team([kinds[j % len(kinds)] for j in range(self.config.humans)], self.config.latency)
 
     def _kinds(self) -> list[PolicySupervisor]:
         """The algorithmic humans of this fleet, one of each kind."""
@@ -98,7 +108,7 @@ class Assembly:
         low, high = self.fleet.action_low, self.fleet.action_high
         return np.min([discrepancy(view.actions, kind.act(view.obs), low, high) for kind in self._kinds()], axis=0)  # type: ignore[no-any-return]
 
-    def _signals(self) -> dict[str, Signal]:
+    def signals(self) -> dict[str, Signal]:
         """What the critics, the classifier and the humans' own judgement say."""
         signals = {name: _estimate(critic) for name, critic in self.learner.critics.items()}
         signals["judgement"] = self._judgement
@@ -124,15 +134,12 @@ def assemble(config: RunConfig) -> Assembly:
     find_task(config.task)
     config = _resolve_defaults(config)
     torch.set_num_threads(config.torch_threads or 1)
-    priority = parse(config.priority, config.thresholds, config.gate)
+    parse(config.priority, config.thresholds, config.gate)  # refused before an expert is looked for
     actor = _expert(config)
     fleet = fleet_of(config, config.robots, config.disturbance)
 
     shape, actions = _obs_shape(fleet, config), len(fleet.action_low)
-    config = dataclasses.replace(
-        config, hidden=hidden_layers(shape, config.hidden),
-        critic=dataclasses.replace(config.critic, hidden=hidden_layers(shape, config.critic.hidden)),
-    )  # fmt: skip
+    config = sized(config, shape)
     known = shape[0] if fleet.state is None else fleet.state.shape[1]
     if isinstance(actor, GaussianActor) and (actor.features > known or len(actor.low) != actions):
         raise ContractError(
@@ -144,8 +151,32 @@ def assemble(config: RunConfig) -> Assembly:
             config = dataclasses.replace(config, success_return=_success_return(config, actor))
         if config.success_return is not None:
             fleet.success_return = config.success_return
+    learner = learner_of(config, shape, fleet.action_low, fleet.action_high)
+    return Assembly(config, fleet, actor, learner.policy, learner)
+
+
+def sized(config: RunConfig, shape: tuple[int, ...]) -> RunConfig:
+    """The configuration with the hidden layers that networks have which see observations of this shape."""
+    return dataclasses.replace(
+        config, hidden=hidden_layers(shape, config.hidden),
+        critic=dataclasses.replace(config.critic, hidden=hidden_layers(shape, config.critic.hidden)),
+    )  # fmt: skip
+
+
+def learner_of(config: RunConfig, shape: tuple[int, ...], low: Array, high: Array) -> ImitationLearner:
+    """The learner of a run, with its policy, data set, critics and classifier; nothing is trained yet.
+
+    Args:
+        config: of the run, `sized`.
+        shape: of an observation: (D,) or (H, W, 3).
+        low, high: bounds of the actions, (A,).
+
+    Raises:
+        ConfigError: an unknown priority.
+    """
+    priority, actions = parse(config.priority, config.thresholds, config.gate), len(low)
     policy = EnsemblePolicy(
-        shape, fleet.action_low, fleet.action_high,
+        shape, low, high,
         members=config.members, hidden=config.hidden, seed=derive(config.seed, "policy/initial weights"),
     )  # fmt: skip
     dataset = AggregatedDataset(
@@ -163,8 +194,7 @@ def assemble(config: RunConfig) -> Assembly:
             policy, dataset, stream(config.seed, "classifier"), derive(config.seed, "classifier/initial weights"),
             beta_h=np.nan if config.gate.beta_h is None else config.gate.beta_h, batch=config.learner.batch,
         )  # fmt: skip
-    learner = ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed)
-    return Assembly(config, fleet, actor, policy, learner)
+    return ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed)
 
 
 def fleet_of(config: RunConfig, num_envs: int, level: str | None, **settings: Any) -> Fleet:

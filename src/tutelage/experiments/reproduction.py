@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tutelage.errors import ConfigError
-from tutelage.experiments import figure_2_3, figure_a_1, gates_table, table_3
+from tutelage.experiments import figure_2_3, figure_a_1, gates_table, table_3, table_3_2
 from tutelage.experiments.study import StudyConfig, run_study
 from tutelage.experiments.tables import tables
 
@@ -17,12 +17,13 @@ def reproduce(
     """Run what is missing of a figure; returns the tables, published and ours, as Markdown.
 
     Args:
-        what: "figure-2.3", "figure-A.1", "table-3.1", "table-3.3", "gates", "figure-5.3" or "figure-C.1".
+        what: "figure-2.3", "figure-A.1", "table-3.1", "table-3.2", "table-3.3", "gates", "figure-5.3" or
+            "figure-C.1".
         tasks: which tasks; empty: those of the figure.
         seeds: root seeds; empty: the figure's own number of them.
         full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000, figure-C.1 3,000; `gates`, which
             nobody published, 2,000 in place of 10,000; table-3.3 has 3 seeds and trains its networks on instead of anew;
-            table-3.1 has the published scale in any case.
+            table-3.1 and table-3.2 have the published scale in any case.
         workers: runs side by side.
         out: folder of the run folders.
         results: folder of the small result files; the experiment has its own folder in it.
@@ -42,6 +43,11 @@ def reproduce(
         each = given.pop("tasks", (gates_table.GatesConfig.task,))
         steps = 10_000 if full else gates_table.GatesConfig.steps
         return "\n".join(gates_table.reproduce(gates_table.GatesConfig(task, steps=steps, **given)) for task in each)
+    if what == "table-3.2":
+        if tasks:
+            raise ConfigError("table-3.2 is about peg insertion; leave out --tasks")
+        seeds = given.get("seeds", table_3_2.Table32Config.seeds)
+        return table_3_2.reproduce(table_3_2.Table32Config(seeds, workers, results=given["results"]))
     if what in table_3.SETTINGS:
         if tasks not in ((), (table_3.SETTINGS[what].task,)):
             raise ConfigError(f"{what} is about {table_3.SETTINGS[what].task}; leave out --tasks")

@@ -57,11 +57,14 @@ class PegInsertion(GoalTask):
     action_low, action_high = (-np.ones(5, dtype=np.float32), np.ones(5, dtype=np.float32))
     summary = "an arm puts a ring over a peg; violation: the ring left the table"
 
+    step, twist = STEP, TWIST
+    """How far an action of 1 moves the gripper, m, and turns it, rad."""
+
     def control(self, frame: Frame, actions: Array) -> Array:
         place, heading = frame["site_xpos"][:, 0], _heading(frame)
         # From where the gripper is, not from where it was told to be: what is pressed against the table does not wind up.
-        place = np.clip(place + STEP * actions[:, :3], arm.LOW, arm.HIGH)
-        yaw = np.clip(np.arctan2(heading[:, 1], heading[:, 0]) + TWIST * actions[:, 3], -arm.TURN, arm.TURN)
+        place = np.clip(place + self.step * actions[:, :3], arm.LOW, arm.HIGH)
+        yaw = np.clip(np.arctan2(heading[:, 1], heading[:, 0]) + self.twist * actions[:, 3], -arm.TURN, arm.TURN)
         fingers = np.where(actions[:, 4] > 0, SHUT, OPEN)
         return np.concatenate([arm.joints(place, yaw), fingers[:, None]], axis=1)
 
