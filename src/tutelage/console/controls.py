@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.console.states import Denied
+from tutelage.fleet.fleet import Fleet
+from tutelage.fleet.policy import Policy
+from tutelage.fleet.supervisor import PolicySupervisor
+from tutelage.policies.kinds import kinds_of
+
+Array = NDArray[Any]
+WIDE = 16 / 9
+"""Width / height of the pictures that people point at."""
 
 
 @dataclass(frozen=True)
@@ -13,9 +28,9 @@ class Axis:
     Attributes:
         index: which one.
         label: what it does.
-        low, high: its bounds as people use them.
-        keys: `KeyboardEvent.code` of the key towards low and of the one towards high.
-        gamepad: "axis0", "-axis1" (reversed) or "button0" where a gamepad can do it.
+        low, high: its bounds.
+        keys: `KeyboardEvent.code` of the key towards low and of the one towards high; "": none.
+        gamepad: "axis0", "-axis1" (reversed), "button0/button1" (low/high) or "button7" (high), where a gamepad can do it.
         toggle: whether a key press switches between low and high, as a gripper's does, and stays there.
     """
 
@@ -33,7 +48,8 @@ class Pointer:
     """What a click and drag on the picture means.
 
     Attributes:
-        kind: "push": the drag is the way that something is to move; "go": the robot goes to where the drag ends.
+        kind: "push": the drag is the way that something is to move, once; "go": the robot goes to where the pointer is, as
+            long as it is pressed.
         camera: in which picture.
         aspect: width / height of the picture for which `world` holds.
         world: (2, 3), from (x, y, 1) of a picture, 0 to 1 from the top left, to the task's coordinates.
@@ -52,17 +68,198 @@ class Controls:
     Attributes:
         axes: of keyboard and gamepad.
         pointer: of the mouse, None where it means nothing.
-        assist: whether the task's algorithmic human can act for the person as long as they hold a key.
+        assist: whether the task's algorithmic human can act for the person as long as they hold `assist_key`.
         once: whether each command is one move (a push); else it holds until the next one or until it is stale.
         help: one line.
+        assist_key: `KeyboardEvent.code`.
     """
 
     axes: tuple[Axis, ...]
-    pointer: Pointer | None
-    assist: bool
-    once: bool
-    help: str
+    pointer: Pointer | None = None
+    assist: bool = False
+    once: bool = False
+    help: str = ""
+    assist_key: str = "Space"
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values."""
         return asdict(self)
+
+
+class Driver:
+    """Turns what people send into actions.
+
+    Args:
+        controls: how they drive.
+        fleet: whose robots.
+        expert: the algorithmic human, for `assist`; None: there is none.
+    """
+
+    def __init__(self, controls: Controls, fleet: Fleet, expert: Policy | None = None) -> None:
+        self.controls, self._fleet = controls, fleet
+        self._low, self._high = fleet.action_low, fleet.action_high
+        self._kinds = [PolicySupervisor(kind, fleet) for kind in kinds_of(expert)] if expert else []
+
+    @property
+    def pushes(self) -> bool:
+        """Whether a drag is one move."""
+        return self.controls.pointer is not None and self.controls.pointer.kind == "push"
+
+    def check(self, action: Sequence[float] | None) -> Array | None:
+        """An action from outside: (A,) float32 within bounds.
+
+        Raises:
+            Denied: bad_command: not that many finite numbers.
+        """
+        if action is None:
+            return None
+        numbers = _numbers(action, len(self._low))
+        if numbers is None:
+            raise Denied("bad_command", f"a command is {len(self._low)} finite numbers")
+        return np.clip(numbers, self._low, self._high).astype(np.float32)
+
+    def check_push(self, push: Any) -> tuple[float, float, float, float] | None:
+        """A drag from outside: from (x, y) to (x, y), each 0 to 1.
+
+        Raises:
+            Denied: bad_command.
+        """
+        if push is None:
+            return None
+        if self.controls.pointer is None:
+            raise Denied("bad_command", "the pointer means nothing at this task")
+        numbers = _numbers(push, 4)
+        if numbers is None or (numbers < -0.5).any() or (numbers > 1.5).any():
+            raise Denied("bad_command", "a push is 4 numbers from 0 to 1")
+        x0, y0, x1, y1 = numbers.tolist()
+        return x0, y0, x1, y1
+
+    def action(self, action: Array | None, push: Sequence[float] | None, obs: Array, robot: int) -> Array | None:
+        """The action (A,) of a command, where the robot shows `obs`; None: it says nothing."""
+        if push is not None and self.controls.pointer is not None:
+            state = self._fleet.state
+            return self._pushed(self.controls.pointer, push, obs if state is None else state[robot])
+        if action is not None and self.controls.once and not action.any():
+            return None  # no key is pressed: a push of nothing would still be a push
+        return action
+
+    def assist(self, obs: Array, robots: Array, humans: Array) -> Array:
+        """What the algorithmic human does for the persons (n,) at the robots (n,), (n, A)."""
+        actions = np.full((len(robots), len(self._low)), np.nan, dtype=np.float32)
+        for k, kind in enumerate(self._kinds):
+            mine = humans % len(self._kinds) == k
+            if mine.any():
+                actions[mine] = np.clip(kind.act(obs[mine], robots[mine]), self._low, self._high)
+        return actions
+
+    def _pushed(self, pointer: Pointer, push: Sequence[float], obs: Array) -> Array | None:
+        world = np.array(pointer.world)
+        start, end = (world @ np.array([x, y, 1.0]) for x, y in (push[:2], push[2:]))
+        if pointer.kind == "go":
+            return np.asarray(np.clip(end - obs[:2], self._low, self._high), dtype=np.float32)
+        way = end - start
+        far = float(np.linalg.norm(way))
+        if far < 1e-3:
+            return None
+        if len(self._low) == 4:  # four discrete pushes: the one that is nearest to the drag
+            from tutelage.envs.tasks.block_pushing import FACES
+
+            return np.asarray(np.where(np.arange(4) == np.argmax(FACES @ way), self._high, self._low))
+        from tutelage.envs.tasks.block_pushing import STEP
+
+        way /= STEP
+        return np.asarray(way / max(1.0, float(np.abs(way).max())), dtype=np.float32)
+
+
+def _numbers(values: Any, n: int) -> Array | None:
+    """n finite numbers as float64 (n,), or None."""
+    if not isinstance(values, Sequence | np.ndarray) or isinstance(values, str) or len(values) != n:
+        return None
+    if not all(isinstance(v, int | float | np.floating) and not isinstance(v, bool) and math.isfinite(v) for v in values):
+        return None
+    return np.array(values, dtype=np.float64)
+
+
+# -- the tasks ----------------------------------------------------------------------------------------------------
+
+_LEFT_RIGHT, _DOWN_UP = ("ArrowLeft", "ArrowRight"), ("ArrowDown", "ArrowUp")
+_PAIRS = (_LEFT_RIGHT, _DOWN_UP, ("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyQ", "KeyR"), ("KeyF", "KeyG"))
+_STICKS = ("axis0", "-axis1", "axis2", "-axis3", "button6/button7", "button4/button5")
+
+
+def controls_of(task: str, fleet: Fleet, assist: bool) -> Controls:
+    """How people drive robots at a task: its own way where it has one, else an axis for each number of an action.
+
+    Args:
+        task: its name.
+        fleet: whose robots.
+        assist: whether there is an algorithmic human.
+    """
+    made = _TASKS.get(task)
+    if made is not None:
+        return made(assist)
+    low, high = fleet.action_low.tolist(), fleet.action_high.tolist()
+    if len(low) > len(_PAIRS):
+        return Controls((), assist=assist, help=f"{len(low)} joints are too many for hands: hold Space, and the expert acts")
+    axes = tuple(Axis(k, f"action {k + 1}", float(low[k]), float(high[k]), _PAIRS[k], _STICKS[k]) for k in range(len(low)))
+    return Controls(axes, assist=assist, help="each pair of keys is one number of the action")
+
+
+def _axis(index: int, label: str, pair: int) -> Axis:
+    return Axis(index, label, -1.0, 1.0, _PAIRS[pair], _STICKS[pair])
+
+
+def _navigation(assist: bool) -> Controls:
+    from tutelage.envs.tasks.navigation import SIZE
+
+    wide, high = SIZE
+    world = ((float(wide), 0.0, -0.5), (0.0, -float(high), high - 0.5))  # as `Navigation.draw` does; +y is up
+    axes = (_axis(0, "right", 0), _axis(1, "up", 1))
+    return Controls(axes, Pointer("go", 0, WIDE, world), assist, help="arrows steer; or press where the robot is to go")
+
+
+def _view() -> Pointer:
+    """Pushing is seen from above, in the middle of a picture that is wider than the table."""
+    from tutelage.envs.tasks.block_pushing import WALL
+
+    view = WALL + 0.01
+    return Pointer("push", 0, WIDE, ((2 * view * WIDE, 0.0, -view * WIDE), (0.0, -2 * view, view)))
+
+
+def _block_pushing(assist: bool) -> Controls:
+    faces = (("right", "ArrowRight", "button15"), ("up", "ArrowUp", "button12"),
+             ("left", "ArrowLeft", "button14"), ("down", "ArrowDown", "button13"))  # fmt: skip
+    axes = tuple(Axis(k, label, 0.0, 1.0, ("", key), pad) for k, (label, key, pad) in enumerate(faces))
+    return Controls(axes, _view(), assist, once=True, help="arrows push the block by 3 cm; or drag on the picture")
+
+
+def _obstacle_pushing(assist: bool) -> Controls:
+    axes = (_axis(0, "right", 0), _axis(1, "up", 1))
+    return Controls(axes, _view(), assist, once=True, help="drag the way the block is to go, at most 3 cm; or arrows")
+
+
+def _peg_insertion(assist: bool) -> Controls:
+    axes = (
+        _axis(0, "right", 0), _axis(1, "away", 1), _axis(2, "up", 3), _axis(3, "turn", 2),
+        Axis(4, "gripper", -1.0, 1.0, ("", "KeyG"), "button0", toggle=True),
+    )  # fmt: skip
+    return Controls(axes, None, assist, help="arrows move the gripper, W and S lift and lower it, A and D turn it, G grips")
+
+
+def _cable_routing(assist: bool) -> Controls:
+    return Controls((_axis(0, "right", 0), _axis(1, "away", 1)), None, assist, help="arrows draw the cable around the pegs")
+
+
+def _ball_balance(assist: bool) -> Controls:
+    axes = (_axis(0, "right leg", 0), _axis(1, "rear left leg", 1), _axis(2, "front left leg", 3))
+    return Controls(axes, None, assist, help="each pair of keys lowers and lifts one leg; Space: the expert balances")
+
+
+_TASKS = {
+    "Navigation": _navigation,
+    "BlockPushing": _block_pushing,
+    "ObstaclePushing": _obstacle_pushing,
+    "PegInsertion": _peg_insertion,
+    "CableRouting": _cable_routing,
+    "BallBalance": _ball_balance,
+}

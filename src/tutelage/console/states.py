@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.console.controls import Controls
 from tutelage.errors import TutelageError
+
+if TYPE_CHECKING:
+    from tutelage.console.controls import Controls
 
 Array = NDArray[Any]
 
@@ -48,6 +50,8 @@ class Description:
         humans: M, seats for operators.
         algorithm: the priority, such as "C.U.R.".
         controls: how people drive.
+        t_reset: timesteps of a hard reset.
+        hold_after, grace, offer_seconds: see `offers.Terms`: fresh, grace and offer.
     """
 
     task: str
@@ -58,6 +62,10 @@ class Description:
     humans: int
     algorithm: str
     controls: Controls
+    t_reset: int = 5
+    hold_after: float = 0.5
+    grace: float = 5.0
+    offer_seconds: float = 15.0
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values."""
@@ -162,18 +170,23 @@ class Offer(Told):
 
 @dataclass(frozen=True)
 class LeaseGranted(Told):
-    """A person may drive a robot from now on."""
+    """A person may drive a robot from now on. waited: seconds since the robot asked; answered: since it was offered, None if
+    it was taken without an offer."""
 
     lease: Lease
+    waited: float = 0.0
+    answered: float | None = None
 
 
 @dataclass(frozen=True)
 class LeaseEnded(Told):
-    """A person may not drive a robot any more, and what they did is on the disk. why: one of `ENDS`."""
+    """A person may not drive a robot any more, and what they did is on the disk. why: one of `ENDS`; seconds: how
+    long they had it."""
 
     robot: int
     lease: str
     why: str
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,276 @@
+"""From what is to be supervised to the parts of the loop: a fleet, its policy, and what learns from people."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import tutelage
+from tutelage.console.offers import Terms
+from tutelage.console.stoppable import StoppableFleet
+from tutelage.errors import ConfigError, RunFolderError
+from tutelage.experiments.assemble import Assembly, assemble
+from tutelage.experiments.config import FORMAT, RunConfig, to_json
+from tutelage.experiments.prepare import prepare
+from tutelage.experiments.run import loop_state, read_config
+from tutelage.fleet.fleet import Fleet
+from tutelage.fleet.policy import Policy
+from tutelage.learning.imitation import ImitationLearner, LearnerConfig
+from tutelage.policies.ensemble import EnsemblePolicy
+from tutelage.store import load_tree, save_tree, write_atomic
+
+Report = Callable[[str, float], None]
+SERVED = "serve.json"
+"""The file of a folder that says what is supervised there."""
+
+
+@dataclass(frozen=True)
+class EngineConfig:
+    """What is supervised, and how.
+
+    Attributes:
+        fleet: "sim:TASK" (a task or "module:function"), or "net:HOME", remote robots of a home made by `tutelage keys`.
+        robots: N of a simulated fleet.
+        humans: M, seats for operators.
+        priority: p-hat.
+        queue: who is next, see `RunConfig`.
+        wait: robots that need somebody stand still until a person comes, see `RunConfig`.
+        hz: timesteps a second.
+        lockstep: the simulation waits for the people who hold robots, each time at most `deadline` seconds.
+        deadline: see there.
+        policy: a run folder to start with its policy; "none": an untrained one; None: clone the algorithmic human first.
+        learner: "process", beside the loop; "inline", within it (the fleet waits); "none": the policy stays as it is.
+        per_sample: gradient steps for each new human sample, beside those of the schedule.
+        swap_every: seconds between two deliveries of weights.
+        t_reset: t_R, timesteps of a hard reset.
+        seed: root seed.
+        out: folder of everything that is kept.
+        terms: how long offers and leases last.
+        run: more settings of the run, by name, such as offline_pairs or learner.
+        save_every: seconds between checkpoints.
+        replay: whether interventions are kept as films.
+    """
+
+    fleet: str = "sim:Navigation"
+    robots: int = 8
+    humans: int = 4
+    priority: str = "C.U.R."
+    queue: Literal["priority", "fifo"] = "priority"
+    wait: bool = False
+    hz: float = 10.0
+    lockstep: bool = False
+    deadline: float = 30.0
+    policy: str | None = None
+    learner: Literal["process", "inline", "none"] = "process"
+    per_sample: float = 5.0
+    swap_every: float = 1.0
+    t_reset: int = 5
+    seed: int = 0
+    out: Path = Path("served")
+    terms: Terms = field(default_factory=Terms)
+    run: dict[str, Any] = field(default_factory=dict)
+    save_every: float = 10.0
+    replay: bool = True
+
+    def __post_init__(self) -> None:
+        kind, _, name = self.fleet.partition(":")
+        if kind not in ("sim", "net") or not name:
+            raise ConfigError(f"unknown fleet {self.fleet!r}: write sim:TASK or net:HOME")
+        if not 0.1 <= self.hz <= 1000:
+            raise ConfigError(f"hz must be from 0.1 to 1000, got {self.hz}")
+        if self.humans < 1 or self.robots < 1:
+            raise ConfigError("a fleet needs at least one robot, and a seat for at least one person")
+        if self.lockstep and kind == "net":
+            raise ConfigError("real robots do not wait: --lockstep is for simulated fleets")
+        if min(self.deadline, self.swap_every, self.save_every) <= 0 or self.per_sample < 0:
+            raise ConfigError("deadline, swap_every and save_every must be positive, and per_sample not negative")
+
+    @property
+    def task(self) -> str:
+        """The name of the task, or of the home."""
+        return self.fleet.partition(":")[2]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the robots are simulated."""
+        return self.fleet.startswith("sim:")
+
+
+@dataclass
+class Parts:
+    """What a loop with people is made of.
+
+    Attributes:
+        config: resolved.
+        fleet: with its emergency stop.
+        assembly: the parts as an algorithmic run would have them; its policy is the one that acts.
+        expert: the algorithmic human, or None.
+        resumed: whether the folder was served before.
+    """
+
+    config: RunConfig
+    fleet: StoppableFleet
+    assembly: Assembly
+    expert: Policy | None
+    resumed: bool
+
+    @property
+    def policy(self) -> EnsemblePolicy:
+        """The one that acts."""
+        return self.assembly.policy
+
+    @property
+    def learner(self) -> ImitationLearner:
+        """Policy, critics and data."""
+        return self.assembly.learner
+
+
+def learner_path(folder: Path) -> Path:
+    """The state of the learner."""
+    return folder / "checkpoint" / "learner.safetensors"
+
+
+def make_parts(config: EngineConfig, report: Report) -> Parts:
+    """Make the parts, new or as the folder has them. Prepares a policy where there is none yet, which takes a while.
+
+    Raises:
+        RunFolderError: the folder holds something else.
+        ConfigError: a fleet, task or combination that cannot work.
+    """
+    folder = config.out
+    if (folder / SERVED).exists():
+        return _again(config)
+    if (folder / "config.json").exists():
+        raise RunFolderError(f"{folder} holds a run that was not served; choose another --out, or give it as --policy")
+    parts = _simulated(config, report) if config.simulated else _remote(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_learner(folder, parts.learner, seen=0, version=0)
+    run = parts.config
+    settings = {"format": FORMAT, "version": tutelage.__version__, "algorithm": run.algorithm, **to_json(run)}
+    write_atomic(folder / "config.json", json.dumps(settings, indent=2).encode())
+    served = {"format": FORMAT, "fleet": config.fleet, "humans": config.humans}
+    write_atomic(folder / SERVED, json.dumps(served, indent=2).encode())  # last: a folder that has it is complete
+    return parts
+
+
+def save_learner(folder: Path, learner: ImitationLearner, seen: int, version: int) -> None:
+    """Keep a learner's state, which includes the samples up to the one with id `seen`."""
+    tree = {"format": FORMAT, "seen": seen, "version": version, "learner": learner.state_dict()}
+    save_tree(learner_path(folder), tree)
+
+
+def load_learner(folder: Path, learner: ImitationLearner) -> tuple[int, int]:
+    """Restore what `save_learner` wrote; returns the last sample's id, and the version.
+
+    Raises:
+        RunFolderError: it is damaged, or of another version.
+    """
+    path = learner_path(folder)
+    tree = load_tree(path)
+    if tree.get("format") != FORMAT:
+        raise RunFolderError(f"{path} has format {tree.get('format')}, this version reads {FORMAT}")
+    try:
+        learner.load_state_dict(tree["learner"])
+        return int(tree["seen"]), int(tree["version"])
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError):
+        raise RunFolderError(f"{path} does not fit {folder / 'config.json'}: one of them is damaged; restore it") from None
+
+
+def learner_of(folder: Path) -> ImitationLearner:
+    """The learner of a folder, as it was saved, for a process of its own: `load_learner` has not been called."""
+    config = read_config(folder)
+    served = json.loads((folder / SERVED).read_text())
+    if not served["fleet"].startswith("sim:"):
+        return _bare(config, config.hidden or (), folder)
+    return assemble(dataclasses.replace(config, robots=1, humans=1, threads=1, torch_threads=1)).learner
+
+
+def _simulated(config: EngineConfig, report: Report) -> Parts:
+    run = _run_config(config)
+    trained = config.policy if config.policy not in (None, "none") else None
+    if trained:
+        before = read_config(Path(trained))
+        if before.task != config.task:
+            raise ConfigError(f"{trained} is a run of {before.task}, not of {config.task}")
+        ours = ("robots", "humans", "priority", "steps", "out", "t_reset", "record", "queue", "wait", "latency")
+        run = dataclasses.replace(before, **{name: getattr(run, name) for name in ours})
+    assembly = assemble(run)
+    _check(assembly)
+    if trained:
+        state = loop_state(Path(trained))
+        try:
+            assembly.learner.load_state_dict(state["learner"])
+        except (LookupError, RuntimeError, TypeError, ValueError):
+            raise RunFolderError(
+                f"{trained} has no learner for the priority {config.priority}; serve it with the one it was trained with"
+            ) from None
+    elif config.policy is None:
+        assembly = prepare(assembly, report)
+    return Parts(assembly.config, StoppableFleet(assembly.fleet), assembly, assembly.actor, resumed=False)
+
+
+def _again(config: EngineConfig) -> Parts:
+    """The parts of a folder that was served before."""
+    folder = config.out
+    try:
+        served = json.loads((folder / SERVED).read_text())
+        fleet, humans, found = str(served["fleet"]), int(served["humans"]), served["format"]
+    except (OSError, ValueError, LookupError, TypeError):
+        raise RunFolderError(f"{folder / SERVED} is damaged; restore it, or choose another --out") from None
+    if found != FORMAT:
+        raise RunFolderError(f"{folder} has format {found}, this version reads {FORMAT}; use the version that wrote it")
+    run = dataclasses.replace(read_config(folder), out=folder)
+    wanted = (config.fleet, config.humans, config.robots if config.simulated else run.robots, config.priority)
+    if wanted != (fleet, humans, run.robots, run.priority):
+        raise RunFolderError(
+            f"{folder} was served with --fleet {fleet} --robots {run.robots} --humans {humans} --priority {run.priority}; "
+            "use the same, or another --out"
+        )
+    if not config.simulated:
+        return dataclasses.replace(_remote(config, run), resumed=True)
+    assembly = assemble(run)
+    load_learner(folder, assembly.learner)
+    return Parts(assembly.config, StoppableFleet(assembly.fleet), assembly, assembly.actor, resumed=True)
+
+
+def _run_config(config: EngineConfig) -> RunConfig:
+    settings: dict[str, Any] = {
+        "task": config.task, "priority": config.priority, "robots": config.robots,
+        "humans": config.humans, "steps": 10**9, "seed": config.seed, "t_reset": config.t_reset,
+        "queue": config.queue, "wait": config.wait, "record": "none", "out": config.out,
+        "metrics_every": max(1, round(config.hz)),
+    }  # fmt: skip
+    if config.learner == "none":
+        settings["learner"] = LearnerConfig(schedule="never")
+    return RunConfig(**{**settings, **config.run})
+
+
+def _check(assembly: Assembly) -> None:
+    """What cannot work is refused before minutes are spent on preparing."""
+    if not assembly.fleet.can_pause:
+        raise ConfigError(f"{assembly.config.task} cannot pause robots, and people need time; serve another task")
+    from tutelage.fleet.priority import parse
+
+    priority = parse(assembly.config.priority, assembly.config.thresholds, assembly.config.gate)
+    if "goal" in priority.needs and not assembly.fleet.goal_conditioned:
+        raise ConfigError(f"{assembly.config.priority} needs a task with a goal, and {assembly.config.task} has none")
+
+
+def _remote(config: EngineConfig, run: RunConfig | None = None) -> Parts:
+    raise ConfigError("remote fleets are not there yet")
+
+
+def _bare(config: RunConfig, hidden: tuple[int, ...], folder: Path) -> ImitationLearner:
+    raise ConfigError("remote fleets are not there yet")
+
+
+def remote_fleet(home: Path) -> Fleet:
+    """The robots of a home, on the network."""
+    from tutelage.remote.fleet import RemoteFleet  # type: ignore[import-not-found]
+
+    fleet: Fleet = RemoteFleet.connect(home)
+    return fleet

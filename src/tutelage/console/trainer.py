@@ -1,0 +1,348 @@
+"""The learner in its own process: it never holds up a timestep, and its death costs nothing.
+
+What people did comes to it through the durable record, so a learner that starts anew, after a crash or with the server,
+learns from all that was acknowledged. Transitions for the critics come through a pipe and may be lost. Weights come back
+through it and replace those of the acting policy between two timesteps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tutelage.console.packing import Tree, pack, unpack
+from tutelage.errors import TutelageError
+from tutelage.fleet.step import Step
+from tutelage.learning.imitation import ImitationLearner
+from tutelage.policies.weights import load_module_state, module_state
+
+Array = NDArray[Any]
+
+BACKLOG = 200
+"""Timesteps that may wait for the learner; then the oldest are dropped."""
+RETRY = 2.0
+"""Seconds until a learner that died is started again."""
+
+
+def weights_of(learner: ImitationLearner) -> Tree:
+    """All that acts: the policy, the critics and the classifier, without what only learning needs."""
+    return {
+        "policy": module_state(learner.policy),
+        "critics": {name: module_state(critic.net) for name, critic in learner.critics.items()},
+        **({"classifier": module_state(learner.classifier.net)} if learner.classifier else {}),
+    }
+
+
+def load_weights(learner: ImitationLearner, weights: Tree) -> None:
+    """Let a learner's networks be those."""
+    load_module_state(learner.policy, weights["policy"])
+    learner.policy.forget()
+    for name, critic in learner.critics.items():
+        load_module_state(critic.net, weights["critics"][name])
+    if learner.classifier:
+        load_module_state(learner.classifier.net, weights["classifier"])
+
+
+class ProcessLearner:
+    """The loop's learner: sends what happened to a process, and swaps in the weights that come back.
+
+    Args:
+        folder: of the server; its record and its `learner.safetensors` are what the process begins with.
+        acting: the learner whose networks act; its data are not used.
+        version: how often the weights were replaced before.
+        per_sample, swap_every, save_every: see `EngineConfig`.
+        notice: told (level, text) when the process died.
+        swapped: told (version, id of the newest sample that the weights know) after each swap.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        acting: ImitationLearner,
+        version: int,
+        per_sample: float,
+        swap_every: float,
+        save_every: float,
+        notice: Callable[[str, str], None] = lambda level, text: None,
+        swapped: Callable[[int, int], None] = lambda version, seen: None,
+    ) -> None:
+        self.version, self.restarts, self.seen = version, 0, 0
+        self.swap_seconds = 0.0
+        """How long the last swap took, which is what learning costs a timestep."""
+        self._folder, self._acting, self._notice, self._swapped = folder, acting, notice, swapped
+        self._numbers = [str(x) for x in (per_sample, swap_every, save_every)]
+        self._lock = threading.Condition()
+        self._outbox: deque[bytes] = deque(maxlen=BACKLOG)
+        self._news: Tree | None = None
+        self._closing = False
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(target=self._run, name="learner", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def pid(self) -> int | None:
+        """Its number, if it runs."""
+        return self._process.pid if self._process is not None and self.alive else None
+
+    def start(self) -> None:
+        """Start the process; it takes some seconds until it learns."""
+        self._thread.start()
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Let the process save what it knows and end."""
+        with self._lock:
+            self._closing = True
+            self._lock.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout)
+        if self.alive and self._process is not None:
+            self._process.kill()
+
+    # -- the learner of the loop --------------------------------------------------------------------------------
+
+    def record(self, step: Step) -> None:
+        """Send a timestep on its way."""
+        moved = step.moved
+        message: Tree = {"t": step.t}
+        if self._acting.critics:
+            message |= {name: getattr(step, name)[moved] for name in ("obs", "actions", "next_obs")}
+        message |= {name: getattr(step, name)[moved] for name in ("violation", "success", "truncated")}
+        content = pack(message)
+        with self._lock:
+            self._outbox.append(content)
+            self._lock.notify_all()
+
+    def update(self, t: int) -> dict[str, float]:
+        """Swap in the newest weights, if there are any; returns the losses that came with them."""
+        with self._lock:
+            news, self._news = self._news, None
+        if news is None:
+            return {}
+        began = time.perf_counter()
+        load_weights(self._acting, news["weights"])
+        self.version, self.seen = self.version + 1, int(news["seen"])
+        self.swap_seconds = time.perf_counter() - began
+        self._swapped(self.version, self.seen)
+        return {name: float(loss) for name, loss in news["losses"].items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: the process keeps its own state."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
+    # -- the process, and the threads that talk to it -----------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._closing:
+            connection = self._launch()
+            reader = threading.Thread(target=self._read, args=(connection,), name="learner-news", daemon=True)
+            reader.start()
+            self._write(connection, reader)
+            with contextlib.suppress(OSError):
+                connection.close()
+            assert self._process is not None
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(8.0 if self._closing else 0.5)
+            if self._closing:
+                return
+            if self._process.poll() is None:
+                self._process.kill()
+                self._process.wait()
+            self.restarts += 1
+            self._notice("warning", "the learner died; robots go on with the newest policy, and it is started again")
+            with self._lock:
+                self._lock.wait_for(lambda: self._closing, RETRY)
+
+    def _launch(self) -> Connection:
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-m", "tutelage.console.trainer", str(theirs.fileno()), str(self._folder), *self._numbers]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "OMP_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL)
+        theirs.close()
+        return Connection(ours.detach())
+
+    def _write(self, connection: Connection, reader: threading.Thread) -> None:
+        while True:
+            with self._lock:
+                self._lock.wait_for(lambda: self._outbox or self._closing or not reader.is_alive(), 1.0)
+                if self._closing or not reader.is_alive():
+                    break
+                messages = list(self._outbox)
+                self._outbox.clear()
+            try:
+                for message in messages:
+                    connection.send_bytes(message)
+            except OSError:
+                break
+        if self._closing:
+            with contextlib.suppress(OSError):
+                connection.send_bytes(pack({"quit": True}))
+
+    def _read(self, connection: Connection) -> None:
+        try:
+            while True:
+                news = unpack(connection.recv_bytes())
+                with self._lock:
+                    self._news = news
+        except (OSError, EOFError, ValueError):
+            with self._lock:
+                self._lock.notify_all()
+
+
+# -- in the process -----------------------------------------------------------------------------------------------
+
+
+class Training:
+    """What the process does: take in samples and transitions, improve, send weights, save.
+
+    Args:
+        folder: of the server.
+        learner: with the state of the folder's `learner.safetensors`.
+        seen: id of the last sample that it knows.
+        per_sample, swap_every, save_every: see `EngineConfig`.
+    """
+
+    CHUNK = 5
+
+    def __init__(
+        self, folder: Path, learner: ImitationLearner, seen: int, per_sample: float, swap_every: float, save_every: float
+    ) -> None:
+        self.folder, self.learner, self.seen = folder, learner, seen
+        self._per_sample, self._swap_every, self._save_every = per_sample, swap_every, save_every
+        self.owed = 0.0
+        self.losses: dict[str, float] = {}
+        self._improved = self._unsaved = False
+        self._read_at = self._sent_at = 0.0
+        self._saved_at = time.monotonic()
+
+    def take_in(self, message: Tree, learn: bool) -> None:
+        """A timestep of the loop, and what its schedule says."""
+        if "obs" in message:
+            self.learner.record(_step(message))
+        else:
+            self.learner._episode_ended = bool((message["violation"] | message["success"] | message["truncated"]).any())
+        if learn:
+            losses = self.learner.update(int(message["t"]))
+            self.losses |= losses
+            self._improved |= bool(losses)
+
+    def read_samples(self) -> None:
+        """New rows of the record."""
+        from tutelage.console.audit import samples_in
+
+        obs, wanted = [], []
+        for sample in samples_in(self.folder, self.seen):
+            obs.append(sample.arrays["obs"])
+            wanted.append(sample.arrays["wanted"])
+            self.seen = sample.id
+        if obs:
+            self.learner.dataset.add(np.stack(obs), np.stack(wanted))
+            self._unsaved = True
+            if self.learner.config.schedule != "never":
+                self.owed = min(self.owed + self._per_sample * len(obs), 5000.0)
+
+    def improve(self) -> None:
+        """Some of the gradient steps that are owed for new samples."""
+        steps = int(min(self.CHUNK, self.owed))
+        if steps:
+            self.losses["policy"] = self.learner.gradient_steps(steps)
+            if self.learner.classifier:
+                self.losses["classifier"] = self.learner.classifier.updates(steps)
+            self.owed -= steps
+            self._improved = True
+
+    def weights_due(self, now: float) -> Tree | None:
+        """What to send, if something is new and it is time."""
+        if not self._improved or now - self._sent_at < self._swap_every:
+            return None
+        self._improved, self._unsaved, self._sent_at = False, True, now
+        losses = {name: loss for name, loss in self.losses.items() if np.isfinite(loss)}
+        return {"weights": weights_of(self.learner), "losses": losses, "seen": self.seen}
+
+    def save(self) -> None:
+        """Keep the state, and the policy for everybody."""
+        from tutelage.console.parts import save_learner
+
+        save_learner(self.folder, self.learner, self.seen, 0)
+        self.learner.policy.save(self.folder / "policy.safetensors", {"seen": self.seen})
+        self._unsaved, self._saved_at = False, time.monotonic()
+
+    def run(self, connection: Connection) -> None:
+        """Until the server says so, or is gone."""
+        while True:
+            messages: list[Tree] = []
+            while connection.poll(0.0 if messages or self.owed >= 1 else 0.1):
+                messages.append(unpack(connection.recv_bytes()))
+                if "quit" in messages[-1]:
+                    self.read_samples()
+                    self.save()
+                    return
+            for k, message in enumerate(messages):
+                self.take_in(message, learn=k >= len(messages) - self.CHUNK)  # when late, only data are taken in
+            now = time.monotonic()
+            if now - self._read_at >= 0.25:
+                self.read_samples()
+                self._read_at = now
+            self.improve()
+            news = self.weights_due(now)
+            if news is not None:
+                connection.send_bytes(pack(news))
+            if self._unsaved and now - self._saved_at >= self._save_every:
+                self._saved_at = now
+                with contextlib.suppress(TutelageError):  # the disk is full; the record still has all that matters
+                    self.save()
+
+
+def _step(message: Tree) -> Step:
+    """The transitions of robots that moved, as a step of a fleet of them, which nobody helps."""
+    from tutelage.fleet.events import Events
+
+    n = len(message["obs"])
+    zeros, nobody = np.zeros(n, dtype=np.int8), np.full(n, -1)
+    return Step(
+        int(message["t"]), message["obs"], message["actions"], message["actions"], np.full_like(message["actions"], np.nan),
+        zeros, nobody, np.zeros(n), message["next_obs"], message["violation"], message["success"], message["truncated"],
+        Events.concatenate([]),
+    )  # fmt: skip
+
+
+def main(arguments: list[str]) -> None:
+    """The process: file number of the pipe, folder, per_sample, swap_every, save_every."""
+    import torch
+
+    from tutelage.console.parts import learner_of, load_learner
+
+    connection, folder = Connection(int(arguments[0])), Path(arguments[1])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which then says "quit"
+    with contextlib.suppress(OSError):
+        os.nice(10)
+    learner = learner_of(folder)
+    torch.set_num_threads(1)
+    seen, _ = load_learner(folder, learner)
+    training = Training(folder, learner, seen, *(float(x) for x in arguments[2:5]))
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+        training.run(connection)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
