@@ -316,7 +316,7 @@ def test_a_full_disk_is_an_error_until_there_is_room_and_loses_nothing(tmp_path:
     said = subprocess.run(
         [sys.executable, "-c", FULL_DISK, str(tmp_path)], capture_output=True, text=True, check=True, timeout=120
     ).stdout.splitlines()
-    assert said[0].startswith("refused: the record cannot be written: ")
+    assert said[0].startswith("refused: the record in ")
     assert said[1:4] == ["still refused True"] * 3
     acknowledged = int(said[-1].removeprefix("acknowledged: "))
     assert 0 < acknowledged < 1000

@@ -232,9 +232,7 @@ class Audit:
                 except (sqlite3.Error, TutelageError, OSError) as error:
                     with self._changed:
                         self._pending = batch + self._pending
-                        self._error = (
-                            f"the record cannot be written: {error}; free some space on the disk of {self.path.parent}"
-                        )
+                        self._error = f"the record in {self.path.parent} cannot be written: {error}"
                         self._changed.notify_all()
                         if not self._closing:
                             self._changed.wait(_RETRY_EVERY)

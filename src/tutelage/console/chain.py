@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tutelage.errors import TutelageError
-from tutelage.files import write_atomic
+from tutelage.files import Lock, write_atomic
 
 START = bytes(32)
 """The hash before the first row."""
@@ -140,6 +140,7 @@ class HeadFile:
     def __init__(self, folder: Path) -> None:
         """folder: of the record."""
         self.path, self._key_path = folder / "record.head", folder / "record.key"
+        self._lock = Lock(folder / "record.lock")
 
     def read(self) -> Head | None:
         """What the file says, or None where there is neither file nor key.
@@ -164,15 +165,16 @@ class HeadFile:
 
     def write(self, head: Head) -> None:
         """Replace it, unless another process wrote a newer one. Raises TutelageError where the disk is full."""
-        with contextlib.suppress(TutelageError):  # a damaged one
-            there = self.read()
-            if there and there.rows > head.rows:
-                return
-        if not self._key_path.exists():
-            write_atomic(self._key_path, secrets.token_bytes(32), private=True)
-        mac = self._mac(self._key_path.read_bytes(), head)
-        content = {"version": 1, "rows": head.rows, "hash": head.hash.hex(), "mac": mac.hex()}
-        write_atomic(self.path, json.dumps(content).encode(), private=True)
+        with self._lock:
+            with contextlib.suppress(TutelageError):  # a damaged one
+                there = self.read()
+                if there and there.rows > head.rows:
+                    return
+            if not self._key_path.exists():
+                write_atomic(self._key_path, secrets.token_bytes(32), private=True)
+            mac = self._mac(self._key_path.read_bytes(), head)
+            content = {"version": 1, "rows": head.rows, "hash": head.hash.hex(), "mac": mac.hex()}
+            write_atomic(self.path, json.dumps(content).encode(), private=True)
 
     @staticmethod
     def _mac(key: bytes, head: Head) -> bytes:
