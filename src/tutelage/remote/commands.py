@@ -71,19 +71,23 @@ def robot(
             from tutelage.remote.weights import PulledPolicy
 
             own = stack.enter_context(PulledPolicy(node))
-        running = stack.enter_context(Robot(node, driver, config, lambda line: print(f"{node.name}: {line}", flush=True), own))
+
+        def report(line: str) -> None:
+            print(f"{node.name}: {line}", flush=True)
+
+        running = stack.enter_context(Robot(node, driver, config, report, own))
         if health is not None:
             stack.enter_context(
                 HealthServer(health, lambda: node_health(node), lambda: {**node.counters(), "robot": running.counters})
             )
         seen = ", ".join(running.eyes.names)
-        print(f"{node.name}: {env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it", flush=True)
+        report(f"{env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it")
         try:
             running.run(stop)
         except DriverFailed as error:
             print(f"tutelage: {error}", file=sys.stderr)
             raise SystemExit(DRIVER_FAILED) from None
-        print(f"{node.name}: ended", flush=True)
+        report("ended")
 
 
 def new(

@@ -43,7 +43,7 @@ class Driver(Protocol):
     * `stop() -> None`: the emergency stop. Called at once, from another thread, also while `send_action` runs; and once more
       after that. Without it, `hold` is called.
     * `release() -> None`: the emergency stop was cleared.
-    * `violation()`, `success()`, `truncated() -> bool`: of the last step, see `Fleet`. They are believed until the next reset.
+    * `violation()`, `success()`, `truncated() -> bool`: see `Fleet`. What ended an episode is said until the next reset.
     * `reward() -> float`: of the last step.
     * `cameras() -> Mapping[str, Callable[[], rgb]]`: what takes a picture, (height, width, 3) uint8, by name.
     * `close() -> None`.
@@ -187,7 +187,7 @@ class FleetDriver:
         self._stopped = False
 
     def get_observation(self) -> Array:
-        return self._obs[0]
+        return np.asarray(self._obs[0])
 
     def send_action(self, action: Array) -> None:
         if self._stopped or any(self._flags.values()):
@@ -276,7 +276,8 @@ def make_driver(name: str, *, render: bool = True, size: tuple[int, int] = (320,
         gym.spec(name)
     except gym.error.Error:
         find_task(name)  # raises, and knows what else may have been meant
-    return GymnasiumDriver(name, **({"render_mode": "rgb_array"} if render else {}))
+    more: dict[str, Any] = {"render_mode": "rgb_array"} if render else {}
+    return GymnasiumDriver(name, **more)
 
 
 def describe(driver: Driver, dt: float, cameras: tuple[str, ...] = ()) -> Description:
@@ -357,7 +358,7 @@ def check_driver(driver: Driver, *, seed: int = 0, steps: int = 50) -> None:
         driver.stop()
         _check_observation(driver, name)
         getattr(driver, "release", lambda: None)()
-    cameras = getattr(driver, "cameras", dict)()
+    cameras: Any = getattr(driver, "cameras", dict)()
     _demand(isinstance(cameras, Mapping) and len(cameras) <= MAX_CAMERAS, f"{name}.cameras() must be at most {MAX_CAMERAS}")
     for camera, grab in cameras.items():
         picture = grab()

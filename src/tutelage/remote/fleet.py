@@ -16,7 +16,7 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,7 @@ from tutelage.remote.wire import (
 )
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
+from tutelage.sgc.publisher import Publisher
 from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
@@ -115,7 +116,8 @@ class RemoteFleet(Fleet):
             raise ConfigError(f"the policy has no robot {missing[0]}; it has {', '.join(known) or 'none'}")
         if not self.names:
             raise ConfigError(
-                f"the policy lets {node.name} drive no robot; write one with: tutelage fleet policy ROBOT... --server {node.name}"
+                f"the policy lets {node.name} drive no robot; "
+                f"write one with: tutelage fleet policy ROBOT... --server {node.name}"
             )
         if hz is not None and not 0.1 <= hz <= 1000:
             raise ConfigError(f"a fleet's rate is 0.1 to 1000 Hz, not {hz:g}")
@@ -208,7 +210,7 @@ class RemoteFleet(Fleet):
             orders = [self._order(i, actions[i], bool(moving[i]), now) for i in range(self.num_envs)]
         for publisher, order in zip(self._commands, orders, strict=True):
             if order is not None:
-                self._send(lambda publisher=publisher, order=order: publisher.send(order))
+                self._send(publisher, order)
 
     def step_wait(self) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
         self._wait()
@@ -262,7 +264,7 @@ class RemoteFleet(Fleet):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         raise ConfigError("a fleet of real robots cannot be checkpointed: the world has no state that could be restored")
 
-    # -- emergency stop, pictures, what there is to know; from any thread ----------------------------------------------------
+    # -- emergency stop, pictures, what there is to know; from any thread -------------------------------------------------
 
     def stop(self, robot: int | None = None) -> None:
         """Emergency stop of a robot, or of all: sent at once, on a lane of its own, until the robot shows it.
@@ -345,7 +347,7 @@ class RemoteFleet(Fleet):
                 total[f"network_{reason}"] = total.get(f"network_{reason}", 0) + count
         return total
 
-    # -- on the network's threads --------------------------------------------------------------------------------------------
+    # -- on the network's threads -------------------------------------------------------------------------------------------
 
     def _on_observation(self, slot: Slot, message: Message) -> None:
         now = time.monotonic()
@@ -361,7 +363,7 @@ class RemoteFleet(Fleet):
             else:
                 slot.counts.add("camera")
 
-    # -- with the lock held --------------------------------------------------------------------------------------------------
+    # -- with the lock held -------------------------------------------------------------------------------------------------
 
     def _states(self, now: float) -> list[str]:
         return [slot.state(now, self.deadline) for slot in self._slots]
@@ -408,7 +410,7 @@ class RemoteFleet(Fleet):
         watch = slot.watched(now)
         return pack_command(Command(self.server, self._number, seen.boot, seen.number, order, watch, period, what))
 
-    # -- without it ------------------------------------------------------------------------------------------------------------
+    # -- without it ---------------------------------------------------------------------------------------------------------
 
     def _wait(self) -> None:
         if self.hz is None:
@@ -428,15 +430,17 @@ class RemoteFleet(Fleet):
         now = time.monotonic()
         for slot, state in zip(self._slots, self._states(now), strict=True):
             seen = slot.newest
-            if state == "online" and slot.was_online and seen is not None and seen.boot == getattr(slot.delivered, "boot", 0):
-                if seen.server != self.server or seen.executed < self._number:
-                    return False
+            if state != "online" or not slot.was_online or seen is None or slot.delivered is None:
+                continue
+            answered = seen.server == self.server and seen.executed >= self._number
+            if seen.boot == slot.delivered.boot and not answered:
+                return False
         return True
 
-    def _send(self, send: Callable[[], None]) -> None:
+    def _send(self, publisher: Publisher, message: bytes) -> None:
         """The network may not take it (no certificate any more, closed): robots then hold by themselves."""
         try:
-            send()
+            publisher.send(message)
         except TutelageError as error:
             log.warning("%s: %s", self.node.name, error)
 
@@ -445,7 +449,7 @@ class RemoteFleet(Fleet):
             self._stops += 1
             message = pack_stop(Stop(self.server, self._stops, operation))
             self._slots[i].stop_at = time.monotonic()
-        self._send(lambda: self._stop_lanes[i].send(message))
+        self._send(self._stop_lanes[i], message)
 
     def _tend(self) -> None:
         """What is owed to robots: stops that they do not show yet, resets, and a question who they are."""
@@ -511,10 +515,7 @@ class RemoteFleet(Fleet):
         with self._news:
             if answer.accepted and slot.reset_number == number:
                 slot.accepted = answer
-                seen = slot.newest  # it may have been quicker than its answer
-                if seen is not None and not seen.flags & Flag.RESETTING:
-                    if seen.boot != answer.boot or seen.episode > answer.episode:
-                        slot.reset, slot.accepted = "", None
+                slot.settle()  # it may have been quicker than its answer
 
     def _remembered(self) -> Description | None:
         try:

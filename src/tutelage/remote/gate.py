@@ -19,7 +19,8 @@ class CommandGate:
     """Takes what arrives on the command lane, gives the newest command that is fresh. Times in seconds of one clock.
 
     Attributes:
-        counts: commands that were dropped, by reason: malformed, shape, other_start, unknown, other_episode, replaced, stale.
+        counts: commands that were dropped, by reason: malformed, shape, other_start, unknown, other_episode, replaced,
+            stale.
         server, heard, heard_at: start and number of the newest genuine command, and when it came; 0: none.
         period: seconds until the server's next command, as it says.
         watch: the cameras that it wants, a bit each.
@@ -39,7 +40,8 @@ class CommandGate:
         self._boot, self._width, self._watchdog = boot, width, watchdog
         self._observed: OrderedDict[int, float] = OrderedDict()
         self._first = 1  # observation of the present episode
-        self._newest: OrderedDict[int, tuple[int, int]] = OrderedDict()  # server -> number, answers
+        self._answered = 0
+        self._newest: OrderedDict[int, int] = OrderedDict()  # server -> number
         self._command: Command | None = None
         self._until = float("-inf")
 
@@ -64,10 +66,9 @@ class CommandGate:
             return self._drop("stale" if 0 < command.answers < next(iter(self._observed), 0) else "unknown")
         if len(command.action) != (self._width if command.order & Order.ACT and not command.order & Order.OWN else 0):
             return self._drop("shape")
-        number, answered = self._newest.get(command.server, (0, self._last_answered()))
-        if command.number <= number or command.answers < answered:
+        if command.number <= self._newest.get(command.server, 0) or command.answers < self._answered:
             return self._drop("replaced")
-        self._newest[command.server] = command.number, command.answers
+        self._newest[command.server], self._answered = command.number, command.answers
         self._newest.move_to_end(command.server)
         while len(self._newest) > SERVERS:
             self._newest.popitem(last=False)
@@ -88,9 +89,6 @@ class CommandGate:
     def until(self) -> float:
         """When the command stops being fresh."""
         return self._until if self._command is not None else float("-inf")
-
-    def _last_answered(self) -> int:
-        return max((answers for _, answers in self._newest.values()), default=0)
 
     def _drop(self, reason: str) -> bool:
         self.counts.add(reason)

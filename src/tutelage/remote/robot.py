@@ -3,7 +3,8 @@
     with Node.open(Path("arm-1")) as node, Robot(node, Arm()) as robot:
         robot.run(ending)
 
-The robot acts at its own rate, in step with the commands while they come. Without a fresh command it holds; see `CommandGate`.
+The robot acts at its own rate, in step with the commands while they come. Without a fresh command it holds; see
+`CommandGate`.
 """
 
 from __future__ import annotations
@@ -140,8 +141,8 @@ class Robot:
         self.policy = policy
         if node.name not in topics.robots_in(_alias_set(node)):
             raise ConfigError(
-                f"the policy has no robot {node.name}: it needs the topics {topics.alias(node.name, topics.OBSERVATION)} and "
-                f"so on; write them with: tutelage fleet policy {node.name} ..."
+                f"the policy has no robot {node.name} (no topic {topics.alias(node.name, topics.OBSERVATION)}); "
+                f"write them with: tutelage fleet policy {node.name} ..."
             )
         self.boot = secrets.randbits(64) | 1
         self._report = report
@@ -157,7 +158,8 @@ class Robot:
         self._answers: OrderedDict[tuple[int, int], Answer] = OrderedDict()
 
         self._number = self._episode = self._step = 0
-        self._return, self._last_action = 0.0, None
+        self._return = 0.0
+        self._last_action: Array | None = None
         self._executed = (0, 0)  # server, number
         self._held = True
         self._failing_since: float | None = None
@@ -276,7 +278,7 @@ class Robot:
                     self._report(f"holds: no fresh command for {self.config.watchdog:g} s")
                 return
             new = command is not None and (command.server, command.number) != executed
-            due = began + self._dt * (LATE if command is not None and not new and not self._over() else EARLY if new else 1.0)
+            due = began + self._dt * (EARLY if new else LATE if not self._held else 1.0)
             until = min(due, self.gate.until) if not self._held else due
             with self._news:
                 if self._asked is not None or self.latch.stopped != stopped:
@@ -336,7 +338,8 @@ class Robot:
         bounded = np.clip(action, self._low, self._high)
         if self.config.slew is not None:
             most = np.float32(self.config.slew * self._dt) * (self._high - self._low)
-            before = np.clip(np.zeros_like(self._low), self._low, self._high) if self._last_action is None else self._last_action
+            still = np.clip(np.zeros_like(self._low), self._low, self._high)
+            before = still if self._last_action is None else self._last_action
             bounded = np.clip(bounded, before - most, before + most)
         return np.asarray(bounded, dtype=np.float32)
 
@@ -401,12 +404,15 @@ class Robot:
         with self._news:
             self._number += 1
             self.gate.observed(self._number, now)
-            heard = bool(self.gate.heard)
+            gate, stale = self.gate, self.gate.counts["stale"]
             message = Observation(
-                self.boot, self._number, self._episode, self._step, flags, self.gate.server, self.gate.heard,
-                self._executed[1] if self._executed[0] == self.gate.server else 0, now - self.gate.heard_at if heard else 0.0, self._return,
-                self.gate.counts["stale"], self.gate.counts.total() - self.gate.counts["stale"] + self.latch.counts.total(),
-                version, self._obs, proposal,
+                self.boot, self._number, self._episode, self._step, flags, gate.server, gate.heard,
+                executed=self._executed[1] if self._executed[0] == gate.server else 0,
+                waited=now - gate.heard_at if gate.heard else 0.0,
+                episode_return=self._return,
+                stale=stale,
+                refused=gate.counts.total() - stale + self.latch.counts.total(),
+                policy=version, obs=self._obs, proposal=proposal,
             )  # fmt: skip
         try:
             self._observations.send(pack_observation(message))

@@ -105,13 +105,19 @@ class Slot:
             if sent is not None:
                 took = max(0.0, now - sent - seen.waited)
                 self.round_trip = took if np.isnan(self.round_trip) else self.round_trip + 0.2 * (took - self.round_trip)
-        if self.accepted is not None and not seen.flags & Flag.RESETTING:
-            if seen.boot != self.accepted.boot or seen.episode > self.accepted.episode:
-                self.reset, self.accepted = "", None
+        self.settle()
         stopped = bool(seen.flags & Flag.STOPPED)
         if self.clear and not stopped and now - self.stop_at > 0:
             self.clear = False
         return True
+
+    def settle(self) -> None:
+        """Is the reset that the robot accepted over?"""
+        seen, answer = self.newest, self.accepted
+        if seen is None or answer is None or seen.flags & Flag.RESETTING:
+            return
+        if seen.boot != answer.boot or seen.episode > answer.episode:
+            self.reset, self.accepted = "", None
 
     def look(self, data: bytes, camera: int, now: float) -> bool:
         """A picture came on the topic of a camera (its index; now in seconds since 1970). Was it taken?"""

@@ -1,11 +1,11 @@
 """The topics of a robot on the fleet network, and the policy that lets robots and server use them.
 
-    ROBOT.observation       robot -> server, the newest wins
-    ROBOT.picture.CAMERA    robot -> server, the newest wins
-    ROBOT.command           server -> robot, the newest wins; session: nobody but the server can have made one
-    ROBOT.stop              server -> robot, reliable, signed: the emergency stop, on a lane of its own
-    ROBOT.service           server asks, robot answers: its description, soft and hard resets
-    fleet.policy            robots ask, server answers: weights of the policy
+ROBOT.observation       robot -> server, the newest wins
+ROBOT.picture.CAMERA    robot -> server, the newest wins
+ROBOT.command           server -> robot, the newest wins; session: nobody but the server can have made one
+ROBOT.stop              server -> robot, reliable, signed: the emergency stop, on a lane of its own
+ROBOT.service           server asks, robot answers: its description, soft and hard resets
+fleet.policy            robots ask, server answers: weights of the policy
 """
 
 from __future__ import annotations

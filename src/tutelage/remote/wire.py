@@ -5,9 +5,9 @@
 Every message is checked here, at the edge: whoever gets one from `unpack_...` may rely on its ranges. Nothing that a message
 says sets aside more memory than the message has bytes.
 
-No field is a time of day. A robot finds out how old a command is from the number of the observation that it answers, which the
-robot sent itself, and a server how long a robot takes to answer from the number of the command that it last heard. So clocks
-need not agree.
+No field is a time of day. A robot finds out how old a command is from the number of the observation that it answers, which
+the robot sent itself, and a server how long a robot takes to answer from the number of the command that it last heard. So
+clocks need not agree.
 """
 
 from __future__ import annotations
@@ -272,11 +272,9 @@ class Description:
         shape = numbers("shape", 1, 4, int)
         check("shape", all(0 < size <= MAX_ARRAY for size in shape) and math.prod(shape) <= MAX_ARRAY // 8)
         check("dtype", table["dtype"] in ("float32", "float64", "uint8"))
-        low, high = (
-            tuple(map(float, numbers(name, 1, 4096, int, float))) for name in ("action_low", "action_high")
-        )
-        good = len(low) == len(high) and all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True))
-        check("action_low", good)
+        low, high = (tuple(map(float, numbers(name, 1, 4096, int, float))) for name in ("action_low", "action_high"))
+        finite = all(map(math.isfinite, (*low, *high)))
+        check("action_low", finite and len(low) == len(high) and all(map(float.__lt__, low, high)))
         check("horizon", type(table["horizon"]) is int and 0 < table["horizon"] < 1 << 31)
         check("task", isinstance(table["task"], str) and len(table["task"]) <= 200)
         check("goal", isinstance(table["goal"], bool))
@@ -375,8 +373,9 @@ def unpack_observation(data: bytes) -> Observation:
             raise Malformed("a proposal that is no vector of float32")
     _ends(body, at)
     return Observation(
-        boot, number, episode, step, Flag(flags), server, heard, executed, waited, total, stale, refused, policy, obs, proposal
-    )
+        boot, number, episode, step, Flag(flags), server, heard, executed, waited, total, stale, refused, policy,
+        obs, proposal,
+    )  # fmt: skip
 
 
 def unpack_command(data: bytes) -> Command:
