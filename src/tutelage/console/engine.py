@@ -129,12 +129,12 @@ class Engine:
         self.offers = Offers(n, run.humans, config.terms, self._log, self.wall)
         self.driver = Driver(controls_of(config.task, fleet, parts.expert is not None), fleet, parts.expert)
         self.people = People(self.offers, self.driver, self.lock, self.clock, config.lockstep, self.operators.used)
-        self.reasons = Reasons(parse(run.priority, run.thresholds, run.gate), self.offers)
+        self.reasons = Reasons(parse(run.priority, run.thresholds, run.gate), self.offers, run.queue == "fifo")
         self.desk = Desk(self.people, self.reasons, self.clock, run.t_reset)
         self.learner = self._learner(parts)
-        self.loop = Loop(
-            fleet, parts.policy, self.reasons, self.people, self.desk, self.learner, parts.assembly.signals(),
-            wait=run.wait, seed=run.seed,
+        self.loop = parts.assembly.loop(
+            fleet=fleet, priority=self.reasons, team=self.people, allocator=self.desk, learner=self.learner, execution=None,
+            overlap=False,
         )  # fmt: skip
         self.recorder = Recorder(config.out, n, run.humans, FOREVER, run.metrics_every, "none")
         self.pace = Pace(self)
@@ -340,7 +340,7 @@ class Recording:
             leases[robot] = {"operator": lease.operator, "id": lease.id, "since": lease.since, "held": bool(held[robot])}
         for robot in np.flatnonzero(loop.violation).tolist():
             reason[robot] = "violated"
-        stopped = engine.parts.fleet.stopped.copy()
+        stopped = engine.parts.fleet.latched.copy()
         return Snapshot(
             loop.t, engine.wall(now), loop.mode.copy(), loop.human_of, loop.age.copy(), tuple(reason), rank,
             loop.online & ~stopped, stopped, held, tuple(queue), leases, engine.policy_version, engine.tick, engine.late,

@@ -9,21 +9,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 import tutelage
 from tutelage.console.offers import Terms
 from tutelage.console.stoppable import StoppableFleet
+from tutelage.envs import experts
+from tutelage.envs.tasks import TASKS
 from tutelage.errors import ConfigError, RunFolderError
-from tutelage.experiments.assemble import Assembly, assemble
+from tutelage.experiments.assemble import Assembly, assemble, learner_of, sized
 from tutelage.experiments.config import FORMAT, RunConfig, to_json
 from tutelage.experiments.prepare import prepare
 from tutelage.experiments.run import loop_state, read_config
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.policy import Policy
+from tutelage.fleet.priority import parse
 from tutelage.learning.imitation import ImitationLearner, LearnerConfig
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.store import load_tree, save_tree, write_atomic
 
 Report = Callable[[str, float], None]
+UNSURE, RISKY = 0.05, 0.5
+"""Thresholds of uncertainty and risk of a policy that was not trained before."""
 SERVED = "serve.json"
 """The file of a folder that says what is supervised there."""
 
@@ -146,13 +153,14 @@ def make_parts(config: EngineConfig, report: Report) -> Parts:
         return _again(config)
     if (folder / "config.json").exists():
         raise RunFolderError(f"{folder} holds a run that was not served; choose another --out, or give it as --policy")
-    parts = _simulated(config, report) if config.simulated else _remote(config)
+    parts = (_simulated if config.simulated else _remote)(config, report)
     folder.mkdir(parents=True, exist_ok=True)
     save_learner(folder, parts.learner, seen=0, version=0)
     run = parts.config
     settings = {"format": FORMAT, "version": tutelage.__version__, "algorithm": run.algorithm, **to_json(run)}
     write_atomic(folder / "config.json", json.dumps(settings, indent=2).encode())
-    served = {"format": FORMAT, "fleet": config.fleet, "humans": config.humans}
+    low, high = (bound.tolist() for bound in (parts.fleet.action_low, parts.fleet.action_high))
+    served = {"format": FORMAT, "fleet": config.fleet, "shape": parts.policy.obs_shape, "low": low, "high": high}
     write_atomic(folder / SERVED, json.dumps(served, indent=2).encode())  # last: a folder that has it is complete
     return parts
 
@@ -180,13 +188,29 @@ def load_learner(folder: Path, learner: ImitationLearner) -> tuple[int, int]:
         raise RunFolderError(f"{path} does not fit {folder / 'config.json'}: one of them is damaged; restore it") from None
 
 
-def learner_of(folder: Path) -> ImitationLearner:
-    """The learner of a folder, as it was saved, for a process of its own: `load_learner` has not been called."""
-    config = read_config(folder)
-    served = json.loads((folder / SERVED).read_text())
-    if not served["fleet"].startswith("sim:"):
-        return _bare(config, config.hidden or (), folder)
-    return assemble(dataclasses.replace(config, robots=1, humans=1, threads=1, torch_threads=1)).learner
+def learner_in(folder: Path) -> ImitationLearner:
+    """The learner of a folder, of the right shape; `load_learner` gives it its state.
+
+    Raises:
+        RunFolderError: the folder is damaged.
+    """
+    served = _served(folder)
+    try:
+        low, high = (np.array(served[name], dtype=np.float32) for name in ("low", "high"))
+        return learner_of(read_config(folder), tuple(served["shape"]), low, high)
+    except (LookupError, TypeError, ValueError):
+        raise RunFolderError(f"{folder / SERVED} is damaged; restore it, or choose another --out") from None
+
+
+def _served(folder: Path) -> dict[str, Any]:
+    try:
+        served = json.loads((folder / SERVED).read_text())
+        found = served["format"]
+    except (OSError, ValueError, LookupError, TypeError):
+        raise RunFolderError(f"{folder / SERVED} is damaged; restore it, or choose another --out") from None
+    if found != FORMAT:
+        raise RunFolderError(f"{folder} has format {found}, this version reads {FORMAT}; use the version that wrote it")
+    return dict(served)
 
 
 def _simulated(config: EngineConfig, report: Report) -> Parts:
@@ -210,31 +234,75 @@ def _simulated(config: EngineConfig, report: Report) -> Parts:
             ) from None
     elif config.policy is None:
         assembly = prepare(assembly, report)
+    else:
+        assembly = _bare(assembly.config, assembly.fleet)
     return Parts(assembly.config, StoppableFleet(assembly.fleet), assembly, assembly.actor, resumed=False)
+
+
+def _remote(config: EngineConfig, report: Report) -> Parts:
+    """Real robots. Where they work at a task that can be simulated, its algorithmic human gives the first demonstrations."""
+    fleet = _connect(config)
+    run = dataclasses.replace(_run_config(config), task=fleet.description.task, robots=fleet.num_envs)  # type: ignore[attr-defined]
+    try:
+        if (config.policy is None and run.task in TASKS) or config.policy not in (None, "none"):
+            small = dataclasses.replace(config, fleet=f"sim:{run.task}", robots=config.humans)
+            assembly = _simulated(small, report).assembly
+            config_of = dataclasses.replace(assembly.config, robots=fleet.num_envs)
+            assembly.fleet.close()
+            if assembly.policy.obs_shape != fleet.single_observation_space.shape:
+                raise ConfigError(f"the robots do not observe what {run.task} shows: {fleet.single_observation_space.shape}")
+            assembly = dataclasses.replace(assembly, config=config_of, fleet=fleet)
+        else:
+            assembly = _bare(run, fleet)
+    except BaseException:
+        fleet.close()
+        raise
+    expert = assembly.actor if run.task in TASKS else None
+    return Parts(assembly.config, StoppableFleet(fleet, paces=True), assembly, expert, resumed=False)
+
+
+def _connect(config: EngineConfig) -> Fleet:
+    from tutelage.remote.fleet import RemoteFleet
+
+    return RemoteFleet.connect(Path(config.task), hz=config.hz)
+
+
+def _bare(run: RunConfig, fleet: Fleet) -> Assembly:
+    """Robots of which nothing is known but what they observe and what they can do."""
+    shape = fleet.single_observation_space.shape or ()
+    thresholds, gate = run.thresholds, run.gate
+    if thresholds.uncertainty is None:  # no run of the cloned policy could say what is much
+        thresholds = dataclasses.replace(thresholds, uncertainty=UNSURE)
+    if thresholds.risk is None:
+        thresholds = dataclasses.replace(thresholds, risk=RISKY)
+    if thresholds.initial is None:
+        thresholds = dataclasses.replace(thresholds, initial=0)
+    run = sized(dataclasses.replace(run, thresholds=thresholds, gate=gate), shape)
+    learner = learner_of(run, shape, fleet.action_low, fleet.action_high)
+    actor = experts.load(run.task)[0] if run.task in TASKS else learner.policy
+    return Assembly(run, fleet, actor, learner.policy, learner)
 
 
 def _again(config: EngineConfig) -> Parts:
     """The parts of a folder that was served before."""
     folder = config.out
-    try:
-        served = json.loads((folder / SERVED).read_text())
-        fleet, humans, found = str(served["fleet"]), int(served["humans"]), served["format"]
-    except (OSError, ValueError, LookupError, TypeError):
-        raise RunFolderError(f"{folder / SERVED} is damaged; restore it, or choose another --out") from None
-    if found != FORMAT:
-        raise RunFolderError(f"{folder} has format {found}, this version reads {FORMAT}; use the version that wrote it")
-    run = dataclasses.replace(read_config(folder), out=folder)
+    served, run = _served(folder), dataclasses.replace(read_config(folder), out=folder)
     wanted = (config.fleet, config.humans, config.robots if config.simulated else run.robots, config.priority)
-    if wanted != (fleet, humans, run.robots, run.priority):
+    if wanted != (served.get("fleet"), run.humans, run.robots, run.priority):
         raise RunFolderError(
-            f"{folder} was served with --fleet {fleet} --robots {run.robots} --humans {humans} --priority {run.priority}; "
-            "use the same, or another --out"
+            f"{folder} was served with --fleet {served.get('fleet')} --robots {run.robots} --humans {run.humans} "
+            f"--priority {run.priority}; use the same, or another --out"
         )
-    if not config.simulated:
-        return dataclasses.replace(_remote(config, run), resumed=True)
-    assembly = assemble(run)
+    if config.simulated:
+        assembly = assemble(run)
+        expert: Policy | None = assembly.actor
+    else:
+        fleet = _connect(config)
+        assembly = _bare(run, fleet)
+        expert = assembly.actor if run.task in TASKS else None
     load_learner(folder, assembly.learner)
-    return Parts(assembly.config, StoppableFleet(assembly.fleet), assembly, assembly.actor, resumed=True)
+    fleet = StoppableFleet(assembly.fleet, paces=not config.simulated)
+    return Parts(assembly.config, fleet, assembly, expert, resumed=True)
 
 
 def _run_config(config: EngineConfig) -> RunConfig:
@@ -251,26 +319,9 @@ def _run_config(config: EngineConfig) -> RunConfig:
 
 def _check(assembly: Assembly) -> None:
     """What cannot work is refused before minutes are spent on preparing."""
-    if not assembly.fleet.can_pause:
-        raise ConfigError(f"{assembly.config.task} cannot pause robots, and people need time; serve another task")
-    from tutelage.fleet.priority import parse
-
-    priority = parse(assembly.config.priority, assembly.config.thresholds, assembly.config.gate)
-    if "goal" in priority.needs and not assembly.fleet.goal_conditioned:
-        raise ConfigError(f"{assembly.config.priority} needs a task with a goal, and {assembly.config.task} has none")
-
-
-def _remote(config: EngineConfig, run: RunConfig | None = None) -> Parts:
-    raise ConfigError("remote fleets are not there yet")
-
-
-def _bare(config: RunConfig, hidden: tuple[int, ...], folder: Path) -> ImitationLearner:
-    raise ConfigError("remote fleets are not there yet")
-
-
-def remote_fleet(home: Path) -> Fleet:
-    """The robots of a home, on the network."""
-    from tutelage.remote.fleet import RemoteFleet  # type: ignore[import-not-found]
-
-    fleet: Fleet = RemoteFleet.connect(home)
-    return fleet
+    run, fleet = assembly.config, assembly.fleet
+    if not fleet.can_pause:
+        raise ConfigError(f"{run.task} cannot pause robots, and people need time; serve another task")
+    needs = parse(run.priority, run.thresholds, run.gate).needs
+    if "goal" in needs and not fleet.goal_conditioned:
+        raise ConfigError(f"{run.priority} needs a task with a goal, and {run.task} has none; use C.U.R. or U.C.")

@@ -218,10 +218,15 @@ class Reasons:
     Robots whose person went away ask too, after all others, until somebody takes them.
 
     `order` and `reason` are those of the last timestep: the robots that need somebody, the neediest first, and why.
+
+    Args:
+        inner: the priority.
+        offers: who waits since when, and whose person went away.
+        fifo: who has waited longest is first, whatever the priority says.
     """
 
-    def __init__(self, inner: Priority, offers: Offers) -> None:
-        self.inner, self._offers = inner, offers
+    def __init__(self, inner: Priority, offers: Offers, fifo: bool = False) -> None:
+        self.inner, self._offers, self._fifo = inner, offers, fifo
         self.order: list[int] = []
         self.reason: list[str] = []
 
@@ -232,7 +237,8 @@ class Reasons:
         ranks = np.hstack([ranks, asked])  # the least of all reasons
         (asking,) = np.nonzero((ranks > 0).any(axis=1))
         waited = np.array([a.since if (a := self._offers.asking.get(r)) else np.inf for r in asking.tolist()])
-        best = asking[np.lexsort([waited, *(-ranks[asking, c] for c in reversed(range(ranks.shape[1])))])]
+        columns = [] if self._fifo else [-ranks[asking, c] for c in reversed(range(ranks.shape[1]))]
+        best = asking[np.lexsort([waited, *columns])]
         self.order = best.tolist()
         self.reason = [self._why(view, ranks[robot], robot) for robot in self.order]
         return ranks

@@ -18,16 +18,22 @@ class StoppableFleet(Fleet):
 
     A stopped robot does not move in any step that begins after `stop` returned (a simulated step that is going on ends; a
     real robot is told at once), and is not online until `clear`: the loop takes its human away.
+
+    Args:
+        inner: the other fleet.
+        paces: whether its steps take as long as a timestep by themselves, as those of real robots do.
     """
 
-    def __init__(self, inner: Fleet) -> None:
-        self.inner = inner
+    def __init__(self, inner: Fleet, paces: bool = False) -> None:
+        self.inner, self.paces = inner, paces
         self.num_envs, self.metadata, self.render_mode = inner.num_envs, inner.metadata, inner.render_mode
         self.single_action_space, self.single_observation_space = inner.single_action_space, inner.single_observation_space
         self.action_space, self.observation_space = inner.action_space, inner.observation_space
         self.horizon, self.goal_conditioned = inner.horizon, inner.goal_conditioned
         self.can_pause, self.can_checkpoint = inner.can_pause, inner.can_checkpoint
         self.stopped = np.zeros(inner.num_envs, dtype=bool)
+        self.latched = self.stopped
+        """Robots that say that they are stopped, whoever told them: those of `stopped`, and maybe more."""
 
     def stop(self, robots: Collection[int]) -> None:
         """Stop robots (indices)."""
@@ -42,11 +48,6 @@ class StoppableFleet(Fleet):
             for robot in robots:
                 self.inner.clear(robot)
         self.stopped[list(robots)] = False
-
-    @property
-    def paces(self) -> bool:
-        """Whether a step takes as long as a timestep by itself."""
-        return bool(getattr(self.inner, "paces", False))
 
     @property
     def state(self) -> Array | None:
@@ -66,6 +67,7 @@ class StoppableFleet(Fleet):
         return obs, reward, terminated, truncated, self._told(info)
 
     def _told(self, info: dict[str, Any]) -> dict[str, Any]:
+        self.latched = self.stopped | info.get("stopped", False)
         return {**info, "online": info.get("online", np.ones(self.num_envs, dtype=bool)) & ~self.stopped}
 
     def state_dict(self) -> dict[str, Any]:

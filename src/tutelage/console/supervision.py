@@ -164,6 +164,12 @@ class Supervision:
         """The newest picture; asking for it again and again is what keeps it coming. None: there is none yet."""
         return self._frames.get(robot, camera, width, height)
 
+    def jpeg(self, robot: int, camera: int) -> tuple[float, bytes] | None:
+        """The newest picture of a robot that sends JPEG itself, as it came: seconds since 1970, and the file; else None."""
+        source = getattr(self.engine.parts.fleet.inner, "jpeg", None)
+        known = 0 <= robot < self.engine.parts.fleet.num_envs and 0 <= camera < len(self.description.cameras)
+        return source(robot, camera) if source is not None and known else None
+
     def metrics(self, since: int = 0) -> list[dict[str, Any]]:
         """The rows of metrics after timestep `since`, oldest first."""
         return [_plain(row) for row in list(self.engine.rows) if row["t"] > since]
@@ -248,8 +254,8 @@ class Supervision:
 
 def _describe(engine: Engine) -> Description:
     config, run, fleet, terms = engine.config, engine.parts.config, engine.parts.fleet, engine.config.terms
-    names = getattr(fleet.inner, "robots", None) or tuple(f"robot {k + 1}" for k in range(fleet.num_envs))
-    cameras = getattr(fleet.inner, "cameras", None) or ("camera",)
+    names = getattr(fleet.inner, "names", None) or tuple(f"robot {k + 1}" for k in range(fleet.num_envs))
+    cameras = getattr(getattr(fleet.inner, "description", None), "cameras", ("camera",))
     return Description(
         config.task, tuple(names), tuple(cameras), config.hz, config.lockstep, run.humans, run.algorithm,
         engine.driver.controls, run.t_reset, terms.fresh, terms.grace, terms.offer,

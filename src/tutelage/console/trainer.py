@@ -330,13 +330,13 @@ def main(arguments: list[str]) -> None:
     """The process: file number of the pipe, folder, per_sample, swap_every, save_every."""
     import torch
 
-    from tutelage.console.parts import learner_of, load_learner
+    from tutelage.console.parts import learner_in, load_learner
 
     connection, folder = Connection(int(arguments[0])), Path(arguments[1])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which then says "quit"
     with contextlib.suppress(OSError):
         os.nice(10)
-    learner = learner_of(folder)
+    learner = learner_in(folder)
     torch.set_num_threads(1)
     seen, _ = load_learner(folder, learner)
     training = Training(folder, learner, seen, *(float(x) for x in arguments[2:5]))
