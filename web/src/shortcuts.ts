@@ -1,0 +1,44 @@
+/** Keys that work everywhere. Esc is for danger: once stops the robot that one drives, twice stops all. */
+
+import { giveBack, takeOver, decline } from "./live";
+import { isDriveKey } from "./drive";
+import { askReset } from "./pages/Stage";
+import { emergencyStop } from "./stop";
+import * as store from "./store";
+import { Mode } from "./modes";
+
+const TWICE = 800; // ms
+let lastEscape = -Infinity;
+
+function escape(event: KeyboardEvent): void {
+  if (event.repeat || !store.canOperate.value) return;
+  if (document.querySelector("dialog[open], details.person[open], details.hand-over[open]")) return; // Esc closes those
+  const at = performance.now();
+  if (at - lastEscape < TWICE) {
+    lastEscape = -Infinity;
+    void emergencyStop(null);
+    return;
+  }
+  lastEscape = at;
+  const driven = store.lease.value?.robot;
+  if (driven !== undefined) void emergencyStop(driven);
+}
+
+function letter(event: KeyboardEvent): void {
+  if (event.repeat || event.ctrlKey || event.metaKey || event.altKey || isDriveKey(event.code)) return;
+  if ((event.target as HTMLElement | null)?.closest?.("input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select, dialog")) return;
+  const first = store.offers.value.keys().next().value;
+  const driven = store.lease.value?.robot;
+  if (event.code === "KeyA" && first !== undefined && driven === undefined) void takeOver(first);
+  else if (event.code === "KeyD" && first !== undefined && driven === undefined) void decline(first);
+  else if (event.code === "KeyG" && driven !== undefined) void giveBack(driven);
+  else if (event.code === "KeyH" && driven !== undefined && store.robots.value[driven]?.value.mode !== Mode.RESETTING) askReset(driven);
+  else return;
+  event.preventDefault();
+}
+
+window.addEventListener("keydown", (event) => {
+  if (!store.me.value) return;
+  if (event.key === "Escape") escape(event);
+  else letter(event);
+});
