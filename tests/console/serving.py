@@ -75,7 +75,9 @@ class Running:
         """A socket of somebody."""
         headers = {"cookie": cookie or self.cookie(name)}
         uri = f"ws://127.0.0.1:{self.port}{path}"
-        with connect(uri, origin=self.origin, additional_headers=headers, max_size=2**24, **options) as connection:  # type: ignore[arg-type]
+        with connect(
+            uri, origin=self.origin, additional_headers=headers, max_size=2**24, close_timeout=1, **options
+        ) as connection:  # type: ignore[arg-type]
             yield Socket(connection)
 
 

@@ -130,12 +130,13 @@ class SmallSupervision(Supervision):
         action: Sequence[float] | None,
         assist: bool = False,
         push: Sequence[float] | None = None,
-    ) -> None:
+    ) -> bool:
         with self._lock:
             self._mine(operator, robot)
             if self.leases[robot].id != lease:
                 raise Denied("stale_lease", "that lease is over")
             self.commands.append((operator, robot, seq, action, assist, push))
+            return True
 
     def renew(self, operator: str, lease: str) -> None:
         if not any(held.id == lease and held.operator == operator for held in self.leases.values()):

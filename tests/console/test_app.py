@@ -3,22 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
-import pytest
 from serving import PASSWORD, Running
-
-
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    static = tmp_path_factory.mktemp("static")
-    (static / "index.html").write_text("<!doctype html><title>Tutelage</title>")
-    (static / "assets").mkdir()
-    (static / "assets" / "console-abc.js").write_text("// page")
-    server = Running(tmp_path_factory.mktemp("run"), static=static)
-    yield server
-    server.close()
 
 
 def test_a_person_logs_in_sees_the_fleet_and_logs_out(running: Running) -> None:

@@ -21,6 +21,7 @@ from tutelage.console.audit import RecordError
 from tutelage.console.context import Context, log
 from tutelage.console.hub import Hub
 from tutelage.console.live import LiveSocket
+from tutelage.console.messages import problem
 from tutelage.console.security import App, Guard, deny_socket
 from tutelage.console.sockets import Socket, admit
 from tutelage.console.supervision import Denied
@@ -86,9 +87,7 @@ def _answer_errors(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def malformed(request: Request, error: RequestValidationError) -> JSONResponse:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])[:80]
-        return JSONResponse({"error": f"{where}: {first['msg']}"[:200]}, 422)
+        return JSONResponse({"error": problem(error.errors()[0])}, 422)
 
     @app.exception_handler(TutelageError)
     async def ours(request: Request, error: TutelageError) -> JSONResponse:

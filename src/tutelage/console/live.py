@@ -108,9 +108,10 @@ class LiveSocket(Socket):
         try:
             if isinstance(said, messages.Command):
                 self._commands += 1
-                self.context.supervision.command(
+                used = self.context.supervision.command(
                     self.name, said.robot, said.lease, said.seq, said.action, said.assist, said.push
                 )
+                self._dropped += not used
                 self._delays.append(1000 * (time.perf_counter() - began))
             elif isinstance(said, messages.Renew):
                 self.context.supervision.renew(self.name, said.lease)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 T = TypeVar("T")
 
@@ -141,10 +142,16 @@ def _parse(form: TypeAdapter[T], text: str) -> T:
     try:
         return form.validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        if first["type"].startswith("union_tag"):
-            raise MalformedError("unknown type of message") from None
-        where = ".".join(str(part) for part in first["loc"])[:80]
-        raise MalformedError(f"{where}: {first['msg']}"[:200] if where else first["msg"][:200]) from None
+        raise MalformedError(problem(error.errors(include_url=False, include_input=False)[0])) from None
     except (ValueError, UnicodeError, RecursionError):
         raise MalformedError("not a message") from None
+
+
+def problem(first: ErrorDetails | dict[str, Any]) -> str:
+    """One line for the first problem that was found, without a word of what was sent."""
+    if first["type"] == "extra_forbidden":
+        return "an unknown field"
+    if first["type"].startswith("union_tag"):
+        return "unknown type of message"
+    where = ".".join(str(part) for part in first["loc"])
+    return (f"{where}: {first['msg']}" if where else first["msg"])[:200]
