@@ -1,86 +1,118 @@
-"""A supervision server that is small and fast enough for tests, and somebody who listens to it."""
+"""A running console for tests, on a free port of this machine, and clients of it."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
+import uvicorn
+from small_supervision import SmallSupervision
+from websockets.sync.client import ClientConnection, connect
+
+from tutelage.console.accounts import Accounts, Role
+from tutelage.console.app import create_app
 from tutelage.console.audit import Audit
-from tutelage.console.offers import Terms
-from tutelage.console.states import LeaseEnded, LeaseGranted, Offer, Snapshot, Stepped, Told
-from tutelage.console.supervision import EngineConfig, Supervision
+from tutelage.console.context import STATIC, Context
+from tutelage.console.passwords import Passwords
+from tutelage.console.security import Site
+from tutelage.console.serve import uvicorn_config
 
-QUICK = Terms(offer=5.0, declined=5.0, ignored=0.2, fresh=0.5, grace=1.0, idle=20.0)
-
-
-def config(out: Path, **changes: Any) -> EngineConfig:
-    """Points on a line; nobody asks for help but who fell, and the policy stays as it is."""
-    settings: dict[str, Any] = {
-        "fleet": "sim:small:point_fleet", "robots": 4, "humans": 2, "priority": "C.", "hz": 50.0, "policy": "none",
-        "learner": "none", "out": out, "terms": QUICK, "t_reset": 3,
-        "run": {"expert": "small:Homing", "hidden": (8,), "members": 2, **changes.pop("run", {})},
-    }  # fmt: skip
-    return EngineConfig(**{**settings, **changes})
+PASSWORD = "correct horse battery"
 
 
-class Serving:
-    """`with Serving(config) as server:` a server that runs, and everything that it told."""
+class Running:
+    """A server, and what it stands on."""
 
-    def __init__(self, config: EngineConfig) -> None:
-        self.config = config
-        self.events: list[Told] = []
-        self._stack = ExitStack()
+    def __init__(self, folder: Path, supervision: Any = None, static: Path = STATIC) -> None:
+        self.folder = folder
+        self.audit = Audit(folder)
+        self.accounts = Accounts(folder, Passwords(time_cost=1, memory_cost=1024))
+        for role in Role:
+            self.accounts.add(role.name.lower(), role, PASSWORD)
+        self.accounts.add("ana", Role.OPERATOR, PASSWORD)
+        self.supervision = supervision or SmallSupervision(self.audit)
+        self.supervision.start()
+        self.context = Context(self.supervision, self.accounts, self.audit, Site(), static)
+        self.server = uvicorn.Server(uvicorn_config(create_app(self.context), "127.0.0.1", 0))
+        self._thread = threading.Thread(target=self.server.run, daemon=True)
+        self._thread.start()
+        deadline = time.monotonic() + 20
+        while not self.server.started:
+            assert time.monotonic() < deadline, "the server does not start"
+            time.sleep(0.01)
+        self.port = self.server.servers[0].sockets[0].getsockname()[1]
+        self.origin = f"http://127.0.0.1:{self.port}"
 
-    def __enter__(self) -> Serving:
-        self.audit = Audit(self.config.out)
-        self._stack.callback(self.audit.close)
-        self.of = Supervision.open(self.config, self.audit)
-        self._stack.callback(self.of.close)
-        self.of.subscribe(self.events.append)
-        self.of.start()
-        return self
+    def close(self) -> None:
+        self.server.should_exit = True
+        self._thread.join(20)
+        self.supervision.close()
+        self.audit.close()
+        self.accounts.close()
 
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
+    def client(self, name: str | None = None, **headers: str) -> httpx.Client:
+        """An HTTP client that behaves as the page does; logged in where a name is given."""
+        usual = {"origin": self.origin, "x-tutelage": "1"} | headers
+        client = httpx.Client(base_url=self.origin, headers=usual, timeout=20)
+        if name:
+            answer = client.post("/api/login", json={"name": name, "password": PASSWORD})
+            assert answer.status_code == 200, answer.text
+        return client
 
-    def wait(self, until: Callable[[], Any], seconds: float = 10.0, why: str = "") -> Any:
-        """What `until` gives as soon as it is true."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if found := until():
-                return found
-            time.sleep(0.005)
-        raise AssertionError(why or "it did not happen in time")
+    def cookie(self, name: str) -> str:
+        """The session cookie of a new session."""
+        with contextlib.closing(self.client(name)) as client:
+            return f"tutelage_session={client.cookies['tutelage_session']}"
 
-    def told(self, kind: type[Told], **values: Any) -> list[Any]:
-        """The events of a kind whose fields have these values."""
-        fits = lambda e: all(getattr(e, name) == value for name, value in values.items())  # noqa: E731
-        return [e for e in list(self.events) if isinstance(e, kind) and fits(e)]
-
-    def wait_told(self, kind: type[Told], seconds: float = 10.0, **values: Any) -> Any:
-        """The first such event."""
-        return self.wait(lambda: self.told(kind, **values), seconds, f"no {kind.__name__} {values}")[0]
-
-    @property
-    def now(self) -> Snapshot:
-        """The newest snapshot."""
-        return self.of.snapshot()
-
-    def steps(self, n: int = 3) -> None:
-        """Let some timesteps pass."""
-        until = self.now.t + n
-        self.wait(lambda: self.now.t >= until, why="the loop stands still")
-
-    def take(self, name: str, robot: int) -> Any:
-        """Somebody takes a robot on their own judgement."""
-        self.of.join(name)
-        self.of.take(name, robot)
-        lease = self.wait_told(LeaseGranted, operator=name).lease
-        self.wait(lambda: self.now.human[robot] >= 0)
-        return lease
+    @contextlib.contextmanager
+    def socket(self, name: str, path: str = "/api/live", cookie: str | None = None, **options: Any) -> Iterator[Socket]:
+        """A socket of somebody."""
+        headers = {"cookie": cookie or self.cookie(name)}
+        uri = f"ws://127.0.0.1:{self.port}{path}"
+        with connect(
+            uri, origin=self.origin, additional_headers=headers, max_size=2**24, close_timeout=1, **options
+        ) as connection:  # type: ignore[arg-type]
+            yield Socket(connection)
 
 
-__all__ = ["LeaseEnded", "LeaseGranted", "Offer", "Serving", "Stepped", "config"]
+class Socket:
+    """A socket of the page."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.connection = connection
+        self.seen: list[dict[str, Any]] = []
+
+    def say(self, type: str, **fields: Any) -> None:
+        self.connection.send(json.dumps({"type": type, **fields}))
+
+    def hear(self, type: str, timeout: float = 5.0, **fields: Any) -> dict[str, Any]:
+        """The next message of a type (and with these fields); others are kept in `seen`."""
+        deadline = time.monotonic() + timeout
+        while True:
+            left = deadline - time.monotonic()
+            assert left > 0, f"no {type} {fields} came, but {[m['type'] for m in self.seen]}"
+            try:
+                message = json.loads(self.connection.recv(left))
+            except TimeoutError:
+                continue
+            self.seen.append(message)
+            if message["type"] == type and fields.items() <= message.items():
+                return message
+
+    def closed(self, timeout: float = 10.0) -> int:
+        """The code with which the server closes it."""
+        deadline = time.monotonic() + timeout
+        try:
+            while time.monotonic() < deadline:
+                with contextlib.suppress(TimeoutError):
+                    self.connection.recv(0.5)
+        except Exception:
+            pass
+        assert self.connection.protocol.close_code is not None, "the server did not close the socket"
+        return self.connection.protocol.close_code
