@@ -13,9 +13,9 @@ from typing import Any
 
 import httpx
 import pytest
+from consoles import PASSWORD, Running, Socket
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from serving import PASSWORD, Running, Socket
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 

@@ -76,8 +76,7 @@ async def login(request: Request, body: Login) -> Response:
                 c.audit.write("login_failed", name if known else "", address=address)
             raise
         try:
-            c.audit.write("login", session.name, address=address)
-            c.audit.flush()
+            c.audit.write_now("login", session.name, address=address)
         except BaseException:
             c.accounts.logout(token)
             raise
@@ -102,7 +101,7 @@ async def set_up(request: Request, body: SetUp) -> Response:
 
     def make() -> tuple[str, Session]:
         account = c.accounts.set_up(body.token, body.name.strip().lower(), body.password)
-        c.audit.write("account", account.name, action="set_up", account=account.name, role=account.role.name.lower())
+        c.audit.write_now("account", account.name, action="set_up", account=account.name, role=account.role.name.lower())
         return c.accounts.begin(account.name, request.cookies.get(COOKIE))
 
     try:
@@ -117,7 +116,7 @@ def logout(request: Request, who: Anybody) -> Response:
     """End this session."""
     c = context_of(request)
     c.accounts.logout(request.cookies[COOKIE])
-    c.audit.write("logout", who.name)
+    c.audit.write_now("logout", who.name)
     response = JSONResponse({})
     response.delete_cookie(COOKIE, path="/", secure=c.site.secure, httponly=True, samesite="strict")
     return response
@@ -137,7 +136,7 @@ async def password(request: Request, who: Anybody, body: NewPassword) -> dict[st
     def change() -> None:
         c.accounts.confirm(who.name, body.old, address_of(request))
         c.accounts.set_password(who.name, body.new, keep=who.key)
-        c.audit.write("account", who.name, action="password", account=who.name)
+        c.audit.write_now("account", who.name, action="password", account=who.name)
 
     try:
         await c.logins.run(change)
@@ -160,7 +159,7 @@ async def add(request: Request, who: Admin, body: NewAccount) -> dict[str, Any]:
 
     def make() -> None:
         account = c.accounts.add(body.name.strip().lower(), Role.of(body.role), body.password)
-        c.audit.write("account", who.name, action="add", account=account.name, role=account.role.name.lower())
+        c.audit.write_now("account", who.name, action="add", account=account.name, role=account.role.name.lower())
 
     await c.logins.run(make)
     return {}
@@ -175,10 +174,10 @@ async def change(request: Request, who: Admin, name: str, body: Change) -> dict[
         if body.role is not None:
             role = Role.of(body.role)
             c.accounts.set_role(name, role)
-            c.audit.write("account", who.name, action="role", account=name, role=role.name.lower())
+            c.audit.write_now("account", who.name, action="role", account=name, role=role.name.lower())
         if body.password is not None:
             c.accounts.set_password(name, body.password, keep=who.key if name == who.name else None)
-            c.audit.write("account", who.name, action="password", account=name)
+            c.audit.write_now("account", who.name, action="password", account=name)
 
     await c.logins.run(apply)
     return {}
@@ -189,7 +188,7 @@ def remove(request: Request, who: Admin, name: str) -> dict[str, Any]:
     """End an account and its sessions."""
     c = context_of(request)
     c.accounts.remove(name)
-    c.audit.write("account", who.name, action="remove", account=name)
+    c.audit.write_now("account", who.name, action="remove", account=name)
     return {}
 
 

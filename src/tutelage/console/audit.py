@@ -109,6 +109,11 @@ class Audit:
         """
         self._add(kind, who, robot, _text(fields), None)
 
+    def write_now(self, kind: str, who: str = "", robot: int | None = None, **fields: Any) -> None:
+        """Add a row and wait until it is on the disk. Raises RecordError as `flush`."""
+        self.write(kind, who, robot, **fields)
+        self.flush()
+
     def sample(self, who: str, robot: int, arrays: Mapping[str, Array], **fields: Any) -> None:
         """Add one timestep of an intervention: arrays such as obs, proposed, executed, wanted, kept exactly (dtype, shape);
         fields such as t, lease, policy_version.

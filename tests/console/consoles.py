@@ -1,0 +1,118 @@
+"""A running console for tests, on a free port of this machine, and clients of it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import uvicorn
+from small_supervision import SmallSupervision
+from websockets.sync.client import ClientConnection, connect
+
+from tutelage.console.accounts import Accounts, Role
+from tutelage.console.app import create_app
+from tutelage.console.audit import Audit
+from tutelage.console.context import STATIC, Context
+from tutelage.console.passwords import Passwords
+from tutelage.console.security import Site
+from tutelage.console.serve import uvicorn_config
+
+PASSWORD = "correct horse battery"
+
+
+class Running:
+    """A server, and what it stands on."""
+
+    def __init__(self, folder: Path, supervision: Any = None, static: Path = STATIC) -> None:
+        self.folder = folder
+        self.audit = Audit(folder)
+        self.accounts = Accounts(folder, Passwords(time_cost=1, memory_cost=1024))
+        for role in Role:
+            self.accounts.add(role.name.lower(), role, PASSWORD)
+        self.accounts.add("ana", Role.OPERATOR, PASSWORD)
+        self.supervision = supervision or SmallSupervision(self.audit)
+        self.supervision.start()
+        self.context = Context(self.supervision, self.accounts, self.audit, Site(), static)
+        self.server = uvicorn.Server(uvicorn_config(create_app(self.context), "127.0.0.1", 0))
+        self._thread = threading.Thread(target=self.server.run, daemon=True)
+        self._thread.start()
+        deadline = time.monotonic() + 20
+        while not self.server.started:
+            assert time.monotonic() < deadline, "the server does not start"
+            time.sleep(0.01)
+        self.port = self.server.servers[0].sockets[0].getsockname()[1]
+        self.origin = f"http://127.0.0.1:{self.port}"
+
+    def close(self) -> None:
+        self.server.should_exit = True
+        self._thread.join(20)
+        self.supervision.close()
+        self.audit.close()
+        self.accounts.close()
+
+    def client(self, name: str | None = None, **headers: str) -> httpx.Client:
+        """An HTTP client that behaves as the page does; logged in where a name is given."""
+        usual = {"origin": self.origin, "x-tutelage": "1"} | headers
+        client = httpx.Client(base_url=self.origin, headers=usual, timeout=20)
+        if name:
+            answer = client.post("/api/login", json={"name": name, "password": PASSWORD})
+            assert answer.status_code == 200, answer.text
+        return client
+
+    def cookie(self, name: str) -> str:
+        """The session cookie of a new session."""
+        with contextlib.closing(self.client(name)) as client:
+            return f"tutelage_session={client.cookies['tutelage_session']}"
+
+    @contextlib.contextmanager
+    def socket(self, name: str, path: str = "/api/live", cookie: str | None = None, **options: Any) -> Iterator[Socket]:
+        """A socket of somebody."""
+        headers = {"cookie": cookie or self.cookie(name)}
+        uri = f"ws://127.0.0.1:{self.port}{path}"
+        with connect(
+            uri, origin=self.origin, additional_headers=headers, max_size=2**24, close_timeout=1, **options
+        ) as connection:  # type: ignore[arg-type]
+            yield Socket(connection)
+
+
+class Socket:
+    """A socket of the page."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.connection = connection
+        self.seen: list[dict[str, Any]] = []
+
+    def say(self, type: str, **fields: Any) -> None:
+        self.connection.send(json.dumps({"type": type, **fields}))
+
+    def hear(self, type: str, timeout: float = 5.0, **fields: Any) -> dict[str, Any]:
+        """The next message of a type (and with these fields); others are kept in `seen`."""
+        deadline = time.monotonic() + timeout
+        while True:
+            left = deadline - time.monotonic()
+            assert left > 0, f"no {type} {fields} came, but {[m['type'] for m in self.seen]}"
+            try:
+                message = json.loads(self.connection.recv(left))
+            except TimeoutError:
+                continue
+            self.seen.append(message)
+            if message["type"] == type and fields.items() <= message.items():
+                return message
+
+    def closed(self, timeout: float = 10.0) -> int:
+        """The code with which the server closes it."""
+        deadline = time.monotonic() + timeout
+        try:
+            while time.monotonic() < deadline:
+                with contextlib.suppress(TimeoutError):
+                    self.connection.recv(0.5)
+        except Exception:
+            pass
+        assert self.connection.protocol.close_code is not None, "the server did not close the socket"
+        return self.connection.protocol.close_code
