@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,12 +37,25 @@ class Field:
         self.folder, self.port = folder, free_port()
         self.made: FleetFolder = new_fleet(folder / "fleet", robots, connect=f"tls/127.0.0.1:{self.port}", policy=policy)
         self.running: list[subprocess.Popen[bytes]] = []
+        self.robots: dict[int, subprocess.Popen[bytes]] = {}
+        """Those that should run, by number; see `revive`."""
         self.count = 0
+
+    def revive(self) -> None:
+        """Start all robots at 20 Hz that do not run."""
+        for number in range(1, len(self.made.robots) + 1):
+            if number not in self.robots or self.robots[number].poll() is not None:
+                self.robots[number] = self.robot(number, "--hz", 20, wait=False)
 
     @property
     def server(self) -> Path:
         """Folder of the server's node."""
         return self.made.server
+
+    def kill(self, number: int) -> None:
+        """As by kill -9; returns when it is dead."""
+        self.robots[number].kill()
+        self.robots[number].wait()
 
     def router(self) -> subprocess.Popen[bytes]:
         """Start it."""
@@ -116,8 +129,3 @@ def drive(step: Callable[[], object], until: Callable[[], object], timeout: floa
     while not until():
         assert time.monotonic() < end, "it did not happen in time"
         step()
-
-
-def all_of(values: Iterable[object]) -> bool:
-    """For lambdas that read well."""
-    return all(values)
