@@ -70,6 +70,11 @@ class Running:
         with contextlib.closing(self.client(name)) as client:
             return f"tutelage_session={client.cookies['tutelage_session']}"
 
+    def numbers(self) -> dict[str, float]:
+        """What /metrics says."""
+        lines = httpx.get(f"{self.origin}/metrics").text.splitlines()
+        return {name: float(value) for name, value in (line.split() for line in lines if not line.startswith("#"))}
+
     @contextlib.contextmanager
     def socket(self, name: str, path: str = "/api/live", cookie: str | None = None, **options: Any) -> Iterator[Socket]:
         """A socket of somebody."""
