@@ -340,7 +340,7 @@ class Recording:
             leases[robot] = {"operator": lease.operator, "id": lease.id, "since": lease.since, "held": bool(held[robot])}
         for robot in np.flatnonzero(loop.violation).tolist():
             reason[robot] = "violated"
-        stopped = engine.parts.fleet.latched.copy()
+        stopped = engine.parts.fleet.latched
         return Snapshot(
             loop.t, engine.wall(now), loop.mode.copy(), loop.human_of, loop.age.copy(), tuple(reason), rank,
             loop.online & ~stopped, stopped, held, tuple(queue), leases, engine.policy_version, engine.tick, engine.late,
@@ -454,8 +454,8 @@ class Pace:
         self._due += period
         if not engine.parts.fleet.paces:
             self._wait_until(self._due)
-        while engine.trouble is not None and not engine.closing:
-            self._hold()
+        while (reason := engine.trouble or engine.audit.error) is not None and not engine.closing:
+            self._hold(reason)
         if engine.config.lockstep:
             self._wait_for_people()
         engine.late = max(0.0, engine.clock() - self._due) if not engine.parts.fleet.paces else 0.0
@@ -487,11 +487,11 @@ class Pace:
                 engine.offers.tick(engine.clock())
                 engine.publish()
 
-    def _hold(self) -> None:
+    def _hold(self, reason: str) -> None:
         """Nobody moves while nothing can be written down."""
         engine = self._engine
-        said, engine.people.frozen = engine.trouble, True
-        engine.herald.tell(Notice(None, "error", f"robots are held, because nothing can be recorded: {said}"))
+        engine.trouble, engine.people.frozen = reason, True
+        engine.herald.tell(Notice(None, "error", f"robots are held, because nothing can be recorded: {reason}"))
         while not engine.closing:
             with engine.lock:
                 engine.lock.wait(0.25)

@@ -222,7 +222,7 @@ def _simulated(config: EngineConfig, report: Report) -> Parts:
             raise ConfigError(f"{trained} is a run of {before.task}, not of {config.task}")
         ours = ("robots", "humans", "priority", "steps", "out", "t_reset", "record", "queue", "wait", "latency")
         run = dataclasses.replace(before, **{name: getattr(run, name) for name in ours})
-    assembly = assemble(run)
+    assembly = _taught(assemble(run), run)
     _check(assembly)
     if trained:
         state = loop_state(Path(trained))
@@ -294,7 +294,7 @@ def _again(config: EngineConfig) -> Parts:
             f"--priority {run.priority}; use the same, or another --out"
         )
     if config.simulated:
-        assembly = assemble(run)
+        assembly = _taught(assemble(run), run)
         expert: Policy | None = assembly.actor
     else:
         fleet = _connect(config)
@@ -315,6 +315,12 @@ def _run_config(config: EngineConfig) -> RunConfig:
     if config.learner == "none":
         settings["learner"] = LearnerConfig(schedule="never")
     return RunConfig(**{**settings, **config.run})
+
+
+def _taught(assembly: Assembly, run: RunConfig) -> Assembly:
+    """A run with the priority C. keeps its policy, for nobody would teach it; people may take robots, and do."""
+    assembly.learner.config = run.learner
+    return dataclasses.replace(assembly, config=dataclasses.replace(assembly.config, learner=run.learner))
 
 
 def _check(assembly: Assembly) -> None:

@@ -32,8 +32,7 @@ class StoppableFleet(Fleet):
         self.horizon, self.goal_conditioned = inner.horizon, inner.goal_conditioned
         self.can_pause, self.can_checkpoint = inner.can_pause, inner.can_checkpoint
         self.stopped = np.zeros(inner.num_envs, dtype=bool)
-        self.latched = self.stopped
-        """Robots that say that they are stopped, whoever told them: those of `stopped`, and maybe more."""
+        self._said = np.zeros(inner.num_envs, dtype=bool)
 
     def stop(self, robots: Collection[int]) -> None:
         """Stop robots (indices)."""
@@ -48,6 +47,11 @@ class StoppableFleet(Fleet):
             for robot in robots:
                 self.inner.clear(robot)
         self.stopped[list(robots)] = False
+
+    @property
+    def latched(self) -> Array:
+        """(N,) bool, robots that are stopped, or say so themselves, whoever told them."""
+        return np.asarray(self.stopped | self._said)
 
     @property
     def state(self) -> Array | None:
@@ -67,7 +71,7 @@ class StoppableFleet(Fleet):
         return obs, reward, terminated, truncated, self._told(info)
 
     def _told(self, info: dict[str, Any]) -> dict[str, Any]:
-        self.latched = self.stopped | info.get("stopped", False)
+        self._said = info.get("stopped", self._said)
         return {**info, "online": info.get("online", np.ones(self.num_envs, dtype=bool)) & ~self.stopped}
 
     def state_dict(self) -> dict[str, Any]:

@@ -158,16 +158,16 @@ class ProcessLearner:
             reader = threading.Thread(target=self._read, args=(connection,), name="learner-news", daemon=True)
             reader.start()
             self._write(connection, reader)
-            with contextlib.suppress(OSError):
-                connection.close()
             assert self._process is not None
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(8.0 if self._closing else 0.5)
-            if self._closing:
-                return
             if self._process.poll() is None:
                 self._process.kill()
                 self._process.wait()
+            reader.join()  # the process is gone, so there is nothing more to read
+            connection.close()
+            if self._closing:
+                return
             self.restarts += 1
             self._notice("warning", "the learner died; robots go on with the newest policy, and it is started again")
             with self._lock:
