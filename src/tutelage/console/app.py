@@ -24,7 +24,7 @@ from tutelage.console.live import LiveSocket
 from tutelage.console.messages import problem
 from tutelage.console.security import App, Guard, deny_socket
 from tutelage.console.sockets import Socket, admit
-from tutelage.console.supervision import Denied
+from tutelage.console.states import Denied
 from tutelage.console.video import Video, VideoSocket
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fastapi import HTTPException, Request
 
@@ -16,7 +16,9 @@ from tutelage.console.accounts import Accounts, Role, Session
 from tutelage.console.audit import Audit
 from tutelage.console.limits import is_loopback
 from tutelage.console.security import COOKIE, Site
-from tutelage.console.supervision import Supervision
+
+if TYPE_CHECKING:
+    from tutelage.console.supervision import Supervision
 
 log = logging.getLogger("tutelage.console")
 T = TypeVar("T")

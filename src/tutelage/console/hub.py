@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from tutelage.console.context import Context, log
 from tutelage.console.plain import plain, text
-from tutelage.console.supervision import Denied, LeaseEnded, LeaseGranted, Metrics, Notice, Offer, Snapshot, Stepped, Told
+from tutelage.console.states import Denied, LeaseEnded, LeaseGranted, Metrics, Notice, Offer, Snapshot, Stepped, Told
 from tutelage.errors import TutelageError
 
 STATE_EVERY = 0.09

@@ -17,7 +17,7 @@ from tutelage.console.hub import Hub, state_message, waiting_for
 from tutelage.console.limits import Bucket
 from tutelage.console.plain import plain, text
 from tutelage.console.sockets import Socket, error
-from tutelage.console.supervision import Denied
+from tutelage.console.states import Denied
 from tutelage.errors import TutelageError
 
 WAITING_MAX = 512

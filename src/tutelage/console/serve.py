@@ -193,4 +193,6 @@ def _listen(host: str, port: int) -> socket.socket:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0][0]
         return socket.create_server((host, port), family=family, backlog=512)
     except (OSError, OverflowError) as error:
-        raise ConfigError(f"cannot listen on {host} port {port}: {getattr(error, 'strerror', None) or error}") from None
+        number = getattr(error, "errno", None)
+        why = os.strerror(number) if number and number > 0 else error
+        raise ConfigError(f"cannot listen on {host} port {port}: {why}") from None
