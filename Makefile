@@ -56,11 +56,14 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-# Rendering tests need an OpenGL library without a screen, network tests need tools for namespaces and address translation.
+# Rendering tests need an OpenGL library without a screen, network tests need tools for namespaces and address translation,
+# tests of the console's page need Chromium.
 # Installed where that is allowed (root and apt); elsewhere the tests that need them skip and say so.
 $(SYSTEM): $(INSTALLED)
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! $(BIN)/python -c "import ctypes; ctypes.CDLL('libEGL.so.1')" 2>/dev/null; then \
 	  apt-get update -qq && apt-get install -qq -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libosmesa6 >/dev/null; fi
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! { command -v ip && command -v nft; } >/dev/null; then \
 	  apt-get update -qq && apt-get install -qq -y --no-install-recommends iproute2 nftables >/dev/null; fi
+	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! command -v chromium >/dev/null; then \
+	  apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium fonts-dejavu-core >/dev/null; fi
 	touch $@

@@ -39,7 +39,9 @@ def test_the_core_needs_no_extra(tmp_path: Path) -> None:
     ("missing", "verb", "extra"),
     [("mujoco", "['run', 'Walker2d']", "mujoco"), ("numba", "['train-expert', 'Ant']", "mujoco"),
      ("robosuite", "['run', 'NutAssemblyRound']", "robosuite"),
-     ("torch.utils.tensorboard", "['run', 'Walker2d', '--tensorboard']", "tensorboard")],
+     ("torch.utils.tensorboard", "['run', 'Walker2d', '--tensorboard']", "tensorboard"),
+     ("fastapi", "['serve']", "console"), ("uvicorn", "['serve']", "console"), ("cv2", "['serve']", "console"),
+     ("argon2", "['accounts', 'add', 'ana']", "console")],
 )  # fmt: skip
 def test_what_needs_an_extra_names_it(missing: str, verb: str, extra: str, tmp_path: Path) -> None:
     said = python(f"from tutelage.cli import main; main({verb})", tmp_path, [missing])
@@ -49,8 +51,8 @@ def test_what_needs_an_extra_names_it(missing: str, verb: str, extra: str, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("verb", ["keys", "router", "proxy", "ping", "top"])
-def test_connectivity_loads_no_learning_library(verb: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("verb", ["keys", "router", "proxy", "ping", "top", "serve", "accounts", "audit"])
+def test_what_needs_no_learning_library_loads_none(verb: str, tmp_path: Path) -> None:
     code = f"""
 import contextlib
 from tutelage.cli import main
