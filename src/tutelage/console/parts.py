@@ -51,7 +51,7 @@ class EngineConfig:
         deadline: see there.
         policy: a run folder to start with its policy; "none": an untrained one; None: clone the algorithmic human first.
         learner: "process", beside the loop; "inline", within it (the fleet waits); "none": the policy stays as it is.
-        per_sample: gradient steps for each new human sample, beside those of the schedule.
+        per_sample: gradient steps for each new human sample, in a process.
         swap_every: seconds between two deliveries of weights.
         t_reset: t_R, timesteps of a hard reset.
         seed: root seed.
@@ -73,7 +73,7 @@ class EngineConfig:
     deadline: float = 30.0
     policy: str | None = None
     learner: Literal["process", "inline", "none"] = "process"
-    per_sample: float = 5.0
+    per_sample: float = 10.0
     swap_every: float = 1.0
     t_reset: int = 5
     seed: int = 0

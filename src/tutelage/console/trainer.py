@@ -3,6 +3,9 @@
 What people did comes to it through the durable record, so a learner that starts anew, after a crash or with the server,
 learns from all that was acknowledged. Transitions for the critics come through a pipe and may be lost. Weights come back
 through it and replace those of the acting policy between two timesteps.
+
+It takes so many gradient steps for each new sample, as fast as it can, whatever the schedule of the run says (unless it is
+"never"); so a policy changes only when people did something. Critics follow their schedule.
 """
 
 from __future__ import annotations
@@ -34,6 +37,8 @@ Array = NDArray[Any]
 
 BACKLOG = 200
 """Timesteps that may wait for the learner; then the oldest are dropped."""
+MOST_OWED = 5000.0
+"""Gradient steps that may be owed for new samples: when people teach faster than it learns, it catches up when they rest."""
 RETRY = 2.0
 """Seconds until a learner that died is started again."""
 
@@ -119,12 +124,13 @@ class ProcessLearner:
     # -- the learner of the loop --------------------------------------------------------------------------------
 
     def record(self, step: Step) -> None:
-        """Send a timestep on its way."""
+        """Send a timestep on its way, for the critics."""
         moved = step.moved
+        if not self._acting.critics:
+            return  # what people do is in the record
         message: Tree = {"t": step.t}
-        if self._acting.critics:
-            message |= {name: getattr(step, name)[moved] for name in ("obs", "actions", "next_obs")}
-        message |= {name: getattr(step, name)[moved] for name in ("violation", "success", "truncated")}
+        for name in ("obs", "actions", "next_obs", "violation", "success", "truncated"):
+            message[name] = getattr(step, name)[moved]
         content = pack(message)
         with self._lock:
             self._outbox.append(content)
@@ -138,9 +144,10 @@ class ProcessLearner:
             return {}
         began = time.perf_counter()
         load_weights(self._acting, news["weights"])
-        self.version, self.seen = self.version + 1, int(news["seen"])
         self.swap_seconds = time.perf_counter() - began
-        self._swapped(self.version, self.seen)
+        if news["taught"]:  # not the critics alone
+            self.version, self.seen = self.version + 1, int(news["seen"])
+            self._swapped(self.version, self.seen)
         return {name: float(loss) for name, loss in news["losses"].items()}
 
     def state_dict(self) -> dict[str, Any]:
@@ -203,6 +210,8 @@ class ProcessLearner:
             while True:
                 news = unpack(connection.recv_bytes())
                 with self._lock:
+                    if self._news is not None:  # not fetched yet
+                        news["taught"] |= self._news["taught"]
                     self._news = news
         except (OSError, EOFError, ValueError):
             with self._lock:
@@ -231,20 +240,22 @@ class Training:
         self._per_sample, self._swap_every, self._save_every = per_sample, swap_every, save_every
         self.owed = 0.0
         self.losses: dict[str, float] = {}
-        self._improved = self._unsaved = False
+        self._improved = self._taught = self._unsaved = False
         self._read_at = self._sent_at = 0.0
         self._saved_at = time.monotonic()
 
     def take_in(self, message: Tree, learn: bool) -> None:
-        """A timestep of the loop, and what its schedule says."""
-        if "obs" in message:
-            self.learner.record(_step(message))
-        else:
-            self.learner._episode_ended = bool((message["violation"] | message["success"] | message["truncated"]).any())
-        if learn:
-            losses = self.learner.update(int(message["t"]))
-            self.losses |= losses
-            self._improved |= bool(losses)
+        """A timestep of the loop: what the critics learn from, and when."""
+        self.learner.record(_step(message))
+        for name, critic in self.learner.critics.items():
+            if learn and self.learns and (int(message["t"]) + 1) % critic.config.every == 0:
+                self.losses[name] = critic.update()
+                self._improved = True
+
+    @property
+    def learns(self) -> bool:
+        """Whether the policy may change."""
+        return self.learner.config.schedule != "never"
 
     def read_samples(self) -> None:
         """New rows of the record."""
@@ -258,8 +269,8 @@ class Training:
         if obs:
             self.learner.dataset.add(np.stack(obs), np.stack(wanted))
             self._unsaved = True
-            if self.learner.config.schedule != "never":
-                self.owed = min(self.owed + self._per_sample * len(obs), 5000.0)
+            if self.learns:
+                self.owed = min(self.owed + self._per_sample * len(obs), MOST_OWED)
 
     def improve(self) -> None:
         """Some of the gradient steps that are owed for new samples."""
@@ -269,15 +280,16 @@ class Training:
             if self.learner.classifier:
                 self.losses["classifier"] = self.learner.classifier.updates(steps)
             self.owed -= steps
-            self._improved = True
+            self._improved = self._taught = True
 
     def weights_due(self, now: float) -> Tree | None:
         """What to send, if something is new and it is time."""
         if not self._improved or now - self._sent_at < self._swap_every:
             return None
+        taught, self._taught = self._taught, False
         self._improved, self._unsaved, self._sent_at = False, True, now
         losses = {name: loss for name, loss in self.losses.items() if np.isfinite(loss)}
-        return {"weights": weights_of(self.learner), "losses": losses, "seen": self.seen}
+        return {"weights": weights_of(self.learner), "losses": losses, "seen": self.seen, "taught": taught}
 
     def save(self) -> None:
         """Keep the state, and the policy for everybody."""

@@ -1,0 +1,135 @@
+"""How people drive: every task has a way, and it means what it says."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tutelage.console.controls import Controls, Driver, controls_of
+from tutelage.console.states import Denied
+from tutelage.envs import experts
+from tutelage.envs.registry import make_fleet
+from tutelage.envs.tasks import TASKS
+
+
+def driver(task: str, n: int = 1) -> tuple[Driver, Any]:
+    fleet: Any = make_fleet(task, n, disturbance="none", threads=1)
+    obs, _ = fleet.reset(seed=0)
+    return Driver(controls_of(task, fleet, assist=True), fleet, experts.load(task)[0]), (fleet, obs)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_can_be_driven(task: str) -> None:
+    drive, (fleet, obs) = driver(task, 2)
+    controls = drive.controls
+    assert controls.assist
+    assert controls.help
+    assert json.loads(json.dumps(controls.to_json()))["axes"] is not None
+    for axis in controls.axes:
+        assert fleet.action_low[axis.index] <= axis.low < axis.high <= fleet.action_high[axis.index]
+    keys = [key for axis in controls.axes for key in axis.keys if key]
+    assert len(set(keys)) == len(keys), "no key means two things"
+    assert controls.assist_key not in keys
+    actions = drive.assist(obs, np.arange(2), np.arange(2))
+    assert actions.shape == (2, len(fleet.action_low))
+    assert np.isfinite(actions).all()
+    fleet.close()
+
+
+def test_the_expert_of_a_task_with_several_kinds_is_the_persons_own() -> None:
+    drive, (_, obs) = driver("ObstaclePushing", 2)
+    one, other = drive.assist(obs[:1], np.array([0]), np.array([0])), drive.assist(obs[:1], np.array([0]), np.array([1]))
+    assert not np.allclose(one, other), "one goes round the obstacle clockwise, the other one does not"
+
+
+def test_a_drag_pushes_the_block_that_way() -> None:
+    drive, (fleet, obs) = driver("ObstaclePushing")
+    block = fleet.states[0, :2].copy()
+    away = block / np.linalg.norm(block)  # off the obstacle
+    x, y = 0.02 * away
+    width = 2 * 0.16 * 16 / 9  # of the picture, m
+    action = drive.action(None, (0.5, 0.5, 0.5 + x / width, 0.5 - y / (2 * 0.16)), obs[0], 0)
+    assert action == pytest.approx(0.02 * away / 0.03, abs=1e-3)
+    fleet.step(action[None])
+    moved = fleet.states[0, :2] - block
+    assert moved @ away > 0.005
+
+
+def test_a_long_drag_is_a_push_of_full_length_in_its_direction() -> None:
+    drive, (_, obs) = driver("ObstaclePushing")
+    action = drive.action(None, (0.1, 0.5, 0.9, 0.6), obs[0], 0)
+    assert action is not None
+    assert np.abs(action).max() == pytest.approx(1.0)
+    assert action[1] < 0 < action[0]
+
+
+@pytest.mark.parametrize(
+    ("drag", "face"),
+    [((0.5, 0.5, 0.6, 0.5), 0), ((0.5, 0.5, 0.5, 0.3), 1), ((0.5, 0.5, 0.4, 0.5), 2), ((0.5, 0.5, 0.5, 0.7), 3)],
+)
+def test_of_four_pushes_the_nearest_to_the_drag(drag: tuple[float, ...], face: int) -> None:
+    drive, (fleet, obs) = driver("BlockPushing")
+    before = fleet.states[0, :2].copy()
+    action = drive.action(None, drag, obs[0], 0)
+    assert action is not None
+    assert int(np.argmax(action)) == face
+    fleet.step(action[None])
+    moved = fleet.states[0, :2] - before
+    assert int(np.argmax(moved @ np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]).T)) == face
+
+
+def test_no_key_and_no_drag_is_no_push() -> None:
+    drive, (_, obs) = driver("BlockPushing")
+    assert drive.controls.once
+    assert drive.action(np.zeros(4), None, obs[0], 0) is None
+    assert drive.action(None, (0.5, 0.5, 0.5, 0.5), obs[0], 0) is None
+
+
+def test_a_robot_in_the_maze_goes_to_where_one_points() -> None:
+    drive, (fleet, obs) = driver("Navigation")
+    target = np.array([12.0, 27.0])
+    x, y = (target[0] + 0.5) / 100, (60.5 - target[1]) / 61
+    for _ in range(8):
+        action = drive.action(None, (0.0, 0.0, x, y), obs[0], 0)
+        obs, *_ = fleet.step(action[None])
+    assert obs[0] == pytest.approx(target)
+
+
+def test_the_picture_of_the_maze_agrees() -> None:
+    """Where the robot is drawn is where one has to point at it."""
+    drive, (fleet, obs) = driver("Navigation")
+    picture = fleet.render_robot(0, 320, 180).astype(int)
+    rows, columns = np.nonzero(np.abs(picture - [214, 70, 50]).sum(axis=2) < 10)
+    x, y = (columns.mean() + 0.5) / 320, (rows.mean() + 0.5) / 180
+    action = drive.action(None, (x, y, x, y), obs[0], 0)
+    assert action == pytest.approx([0.0, 0.0], abs=0.5)
+
+
+def test_the_picture_of_the_table_agrees() -> None:
+    drive, (fleet, _) = driver("ObstaclePushing")
+    picture = fleet.render_robot(0, 320, 180).astype(int)
+    rows, columns = np.nonzero(np.abs(picture - [40, 80, 200]).sum(axis=2) < 10)
+    pointer = drive.controls.pointer
+    assert pointer is not None
+    there = np.array(pointer.world) @ [(columns.mean() + 0.5) / 320, (rows.mean() + 0.5) / 180, 1.0]
+    assert there == pytest.approx(fleet.states[0, :2], abs=0.004)
+
+
+@pytest.mark.parametrize("push", [[0.1] * 3, "push", [0.1, 0.2, 0.3, float("nan")], [9.0, 0.0, 0.0, 0.0], [None] * 4])
+def test_bad_pushes_are_refused(push: Any) -> None:
+    drive, _ = driver("ObstaclePushing")
+    with pytest.raises(Denied) as denied:
+        drive.check_push(push)
+    assert denied.value.code == "bad_command"
+
+
+def test_a_fleet_of_somebody_else_has_an_axis_for_each_number() -> None:
+    from fakes import PointFleet
+
+    controls = controls_of("my_pkg:robots", PointFleet(1), assist=False)
+    assert isinstance(controls, Controls)
+    assert [axis.index for axis in controls.axes] == [0]
+    assert not controls.assist
