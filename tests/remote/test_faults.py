@@ -286,6 +286,6 @@ def test_told_to_end_a_robot_holds_and_exits_with_0(field: Field, fleet: RemoteF
     all_move(fleet)
     robot = field.robots[2]
     robot.send_signal(signal.SIGTERM)
-    assert robot.wait(10) == 0
+    assert robot.wait(10) == 0, said(robot)
     assert field.notes(2)[-1].what == "hold"
     assert said(robot).endswith("robot-2: ended\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -58,6 +59,7 @@ def robot(
     from tutelage.sgc.node import Node
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    status = 0
     config = RobotConfig(hz, watchdog, slew, camera_hz, quality, seed)
     if min(size) < 16 or max(size) > 4096:
         raise ConfigError(f"pictures are 16 to 4096 pixels wide and high, not {size[0]} x {size[1]}")
@@ -86,8 +88,10 @@ def robot(
             running.run(stop)
         except DriverFailed as error:
             print(f"tutelage: {error}", file=sys.stderr)
-            raise SystemExit(DRIVER_FAILED) from None
-        report("ended")
+            status = DRIVER_FAILED
+        else:
+            report("ended")
+    _leave(status)
 
 
 def new(
@@ -154,6 +158,17 @@ def status(home: Positional[Path], seconds: float = 3.0) -> None:
         for row in fleet.status():
             age = "" if row["age"] is None else f"heard {row['age']:.2f} s ago, episode {row['episode']}, step {row['step']}"
             print(f"{row['name']:<24} {row['state']:<10} {age} {row['says']}".rstrip())
+
+
+def _leave(status: int) -> None:
+    """End the program now that all is closed.
+
+    Threads that still wait inside of the network's library would be torn out of it by the interpreter's own way to end, and
+    abort the program ("FATAL: exception not rethrown"), now and then: whoever started it would take that for a crash.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 VERBS: dict[str, Callable[..., None]] = {"new": new, "policy": policy, "status": status}

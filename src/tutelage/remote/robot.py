@@ -162,6 +162,8 @@ class Robot:
         self._last_action: Array | None = None
         self._executed = (0, 0)  # server, number
         self._held = True
+        self._told: Any = None
+        self._told_at = float("-inf")
         self._failing_since: float | None = None
         self._obs: Array | None = None
 
@@ -305,7 +307,11 @@ class Robot:
             return
         now = time.monotonic()
         watched = self.gate.watch if now - self.gate.heard_at < WATCHED else 0
-        self._publish(self._flags())
+        # A robot that is faster than its server need not tell it more often than twice a step, without news.
+        news = (self._executed, self._flags(), self._episode)
+        if news != self._told or now - self._told_at >= min(0.1, 0.5 * self.gate.period or 0.1) - 0.5 * self._dt:
+            self._told, self._told_at = news, now
+            self._publish(self._flags())
         self.eyes.look(watched, now)
 
     def _act(self) -> None:
