@@ -6,7 +6,7 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +29,16 @@ PASSWORD = "correct horse battery"
 class Running:
     """A server, and what it stands on."""
 
-    def __init__(self, folder: Path, supervision: Any = None, static: Path = STATIC) -> None:
+    def __init__(
+        self, folder: Path, open_supervision: Callable[[Audit], Any] = SmallSupervision, static: Path = STATIC
+    ) -> None:
         self.folder = folder
         self.audit = Audit(folder)
         self.accounts = Accounts(folder, Passwords(time_cost=1, memory_cost=1024))
         for role in Role:
             self.accounts.add(role.name.lower(), role, PASSWORD)
         self.accounts.add("ana", Role.OPERATOR, PASSWORD)
-        self.supervision = supervision or SmallSupervision(self.audit)
+        self.supervision = open_supervision(self.audit)
         self.supervision.start()
         self.context = Context(self.supervision, self.accounts, self.audit, Site(), static)
         self.server = uvicorn.Server(uvicorn_config(create_app(self.context), "127.0.0.1", 0))
@@ -98,17 +100,21 @@ class Socket:
 
     def hear(self, type: str, timeout: float = 5.0, **fields: Any) -> dict[str, Any]:
         """The next message of a type (and with these fields); others are kept in `seen`."""
+        return self.hear_any((type,), timeout, **fields)
+
+    def hear_any(self, types: Sequence[str], timeout: float = 5.0, **fields: Any) -> dict[str, Any]:
+        """The same for several types."""
         deadline = time.monotonic() + timeout
         while True:
             left = deadline - time.monotonic()
-            assert left > 0, f"no {type} {fields} came, but {[m['type'] for m in self.seen]}"
+            assert left > 0, f"no {types} {fields} came, but {[m for m in self.seen if m['type'] not in ('hello', 'state', 'metrics')]}"
             try:
                 message = json.loads(self.connection.recv(left))
             except TimeoutError:
                 continue
             self.seen.append(message)
-            if message["type"] == type and fields.items() <= message.items():
-                return message
+            if message["type"] in types and fields.items() <= message.items():
+                return dict(message)
 
     def closed(self, timeout: float = 10.0) -> int:
         """The code with which the server closes it."""
