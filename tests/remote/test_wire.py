@@ -48,6 +48,7 @@ KINDS: list[tuple[Any, Callable[[Any], bytes], Callable[[bytes], Any]]] = [
     (asks, wire.pack_ask, wire.unpack_ask),
     (answers, wire.pack_answer, wire.unpack_answer),
     (st.just(DESCRIPTION), wire.pack_description, wire.unpack_description),
+    (st.builds(wire.Weights, st.integers(0, 2**32 - 1), st.binary(max_size=50)), wire.pack_weights, wire.unpack_weights),
     (st.just(PICTURE), wire.pack_picture, wire.unpack_picture),
 ]
 

@@ -1,6 +1,6 @@
 """Table 8.3: how long a fleet of 4 arms communicates in a step, over the network and over SSH and SFTP.
 
-A step is an action to every robot and the image after it from every robot, without learning and without motion. The published
+A step is an action to every robot and the image after it from every robot, without learning and motion. The published
 numbers are of arms, a server and a link between buildings or states; ours are of processes on one machine, so they are what
 the software takes. Both ways of using SSH are measured: connections that are kept open, and new ones for each step.
 """

@@ -42,15 +42,19 @@ from tutelage.remote.wire import (
     Order,
     Stop,
     StopOperation,
+    Weights,
     pack_ask,
     pack_command,
     pack_stop,
+    pack_weights,
     unpack_answer,
     unpack_description,
+    unpack_weights,
 )
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
 from tutelage.sgc.publisher import Publisher
+from tutelage.sgc.transport.base import Handle
 from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
@@ -132,6 +136,8 @@ class RemoteFleet(Fleet):
         self._news = threading.Condition()
         self._closed = threading.Event()
         self._pool = Workers("fleet-ask", 8, 4 * self.num_envs + 64)
+        self._weights: Weights | None = None
+        self._served: Handle | None = None
         self._number = self._asks = self._stops = 0
         self._tick = float("-inf")
         self._active: Mask = np.zeros(self.num_envs, dtype=bool)
@@ -251,6 +257,8 @@ class RemoteFleet(Fleet):
             self._news.notify_all()
         for subscription in self._subscriptions:
             subscription.close()
+        if self._served is not None:
+            self._served.close()
         for publisher in (*self._commands, *self._stop_lanes):
             publisher.close()
         self._pool.close()
@@ -309,6 +317,30 @@ class RemoteFleet(Fleet):
             found = slot.pictures.get(camera)
         return None if found is None else (found[0], found[1].jpeg)
 
+    def proposals(self) -> tuple[Array, NDArray[np.int64]]:
+        """What robots that have the policy themselves would do, (N, A) float32, and its version (N,); 0: they have none.
+
+        Of the observation that the loop was given last. Where `step` gets the very same action, the robot goes on by itself.
+        """
+        with self._news:
+            actions = np.zeros((self.num_envs, len(self.action_low)), dtype=np.float32)
+            versions = np.zeros(self.num_envs, dtype=np.int64)
+            for i, slot in enumerate(self._slots):
+                seen = slot.delivered
+                if seen is not None and seen.proposal is not None:
+                    actions[i], versions[i] = seen.proposal, seen.policy
+            return actions, versions
+
+    def offer_policy(self, weights: Weights) -> None:
+        """Hand out these weights to the robots that ask for them, from now on.
+
+        Raises:
+            NotAllowed: the fleet network's policy does not let this node.
+        """
+        if self._weights is None:
+            self._served = self.node.serve(topics.WEIGHTS, self._on_weights)
+        self._weights = weights
+
     def status(self) -> list[dict[str, Any]]:
         """Of each robot: name, state (never, gone, misfit, asking, stopped, resetting, fault, online), seconds since it was
         heard, round trip in seconds, episode, step, starts, what it and we refused, and what there is to say."""
@@ -354,6 +386,11 @@ class RemoteFleet(Fleet):
         with self._news:
             if slot.observe(message.payload, self._description, self.server, now):
                 self._news.notify_all()
+
+    def _on_weights(self, message: Message) -> bytes:
+        asked, weights = unpack_weights(message.payload), self._weights
+        assert weights is not None
+        return pack_weights(Weights(weights.version, b"" if asked.version == weights.version else weights.data))
 
     def _on_picture(self, slot: Slot, camera: str, message: Message) -> None:
         with self._news:
@@ -406,6 +443,8 @@ class RemoteFleet(Fleet):
             return None
         period = 1.0 / self.hz if self.hz else 0.0
         order, what = (Order.ACT, action) if moving else (Order(0), action[:0])
+        if moving and seen.proposal is not None and np.array_equal(action, seen.proposal):
+            order, what = Order.ACT | Order.OWN, action[:0]
         slot.sent(self._number, now)
         watch = slot.watched(now)
         return pack_command(Command(self.server, self._number, seen.boot, seen.number, order, watch, period, what))

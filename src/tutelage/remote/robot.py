@@ -32,7 +32,6 @@ from tutelage.remote.latch import Latch
 from tutelage.remote.wire import (
     Answer,
     Ask,
-    Command,
     Counts,
     Flag,
     Malformed,
@@ -166,6 +165,8 @@ class Robot:
         self._told_at = float("-inf")
         self._failing_since: float | None = None
         self._obs: Array | None = None
+        self._proposal: Array | None = None
+        self._version = 0
 
         self._reset(self.config.seed, hard=False)
         cameras = self._working_cameras()
@@ -325,7 +326,11 @@ class Robot:
         if command is None or not command.order & Order.ACT or self._over():
             self._hold()
             return
-        action = self._bounded(self._wanted(command))
+        wanted = self._proposal if command.order & Order.OWN else command.action
+        if wanted is None:  # it has no policy any more that it could go on with: it was started again
+            self._hold()
+            return
+        action = self._bounded(wanted)
         self.driver.send_action(action)
         if self.latch.stopped:  # while the action was being sent: the stop must be the last word
             getattr(self.driver, "stop", self.driver.hold)()
@@ -334,11 +339,6 @@ class Robot:
         self._held, self._last_action = False, action
         self._step += 1
         self._return += float(getattr(self.driver, "reward", float)())
-
-    def _wanted(self, command: Command) -> Array:
-        if command.order & Order.OWN and self.policy is not None and self._obs is not None:
-            return np.asarray(self.policy.act(self._obs[None])[0], dtype=np.float32)
-        return command.action
 
     def _bounded(self, action: Array) -> Array:
         bounded = np.clip(action, self._low, self._high)
@@ -355,6 +355,10 @@ class Robot:
 
     def _look(self) -> None:
         self._obs = observation_of(self.driver)
+        self._proposal, self._version = None, 0
+        if self.policy is not None and self.policy.version:
+            self._version = self.policy.version
+            self._proposal = self._bounded(np.asarray(self.policy.act(self._obs[None])[0], np.float32))
 
     def _over(self) -> bool:
         """Has the episode ended? Then the robot stands still until it is reset."""
@@ -403,9 +407,6 @@ class Robot:
 
     def _publish(self, flags: Flag) -> None:
         assert self._obs is not None
-        proposal, version = None, 0
-        if self.policy is not None and self.policy.version:
-            proposal, version = np.asarray(self.policy.act(self._obs[None])[0], np.float32), self.policy.version
         now = time.monotonic()
         with self._news:
             self._number += 1
@@ -418,7 +419,7 @@ class Robot:
                 episode_return=self._return,
                 stale=stale,
                 refused=gate.counts.total() - stale + self.latch.counts.total(),
-                policy=version, obs=self._obs, proposal=proposal,
+                policy=self._version, obs=self._obs, proposal=self._proposal,
             )  # fmt: skip
         try:
             self._observations.send(pack_observation(message))

@@ -33,6 +33,8 @@ MAX_ARRAY = 16 << 20
 """Bytes of the largest array."""
 MAX_PICTURE = 4 << 20
 """Bytes of the largest picture, compressed."""
+MAX_WEIGHTS = 128 << 20
+"""Bytes of the weights of a policy."""
 MAX_SIDE = 8192
 """Pixels of the longest side of a picture."""
 MAX_CAMERAS = 16
@@ -46,7 +48,7 @@ _STOP = struct.Struct("<QQB")
 _ASK = struct.Struct("<QQBBQ")
 _ANSWER = struct.Struct("<BQI")
 _PICTURE = struct.Struct("<QQBHH")
-_WEIGHTS = struct.Struct("<II")
+_WEIGHTS = struct.Struct("<I")
 _DTYPES = tuple(np.dtype(name) for name in ("<f4", "<f8", "u1", "<i2", "<i4", "<u2"))
 
 
@@ -216,6 +218,18 @@ class Picture:
     jpeg: bytes
 
 
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Weights of the policy, from the server; and, without data, the question of a robot that has this version (0: none).
+
+    Attributes:
+        data: a safetensors file; empty: the robot has the newest already.
+    """
+
+    version: int
+    data: bytes
+
+
 @dataclass(frozen=True)
 class Description:
     """What a robot is; all robots of a fleet are alike.
@@ -348,6 +362,11 @@ def pack_description(d: Description) -> bytes:
     return _head(Kind.DESCRIPTION) + json.dumps(d.to_json()).encode()
 
 
+def pack_weights(w: Weights) -> bytes:
+    """See `Weights`."""
+    return _head(Kind.WEIGHTS) + _WEIGHTS.pack(w.version) + w.data
+
+
 # -- from bytes -----------------------------------------------------------------------------------------------------------
 
 
@@ -453,6 +472,19 @@ def unpack_picture(data: bytes) -> Picture:
     if jpeg_size(jpeg) != (width, height):
         raise Malformed("a picture that is no JPEG of the size that it says")
     return Picture(boot, number, camera, width, height, jpeg)
+
+
+def unpack_weights(data: bytes) -> Weights:
+    """Read weights, or the question for them. The file in them is not read.
+
+    Raises:
+        Malformed: not one.
+    """
+    if len(data) > MAX_WEIGHTS:
+        raise Malformed("weights that are too large")
+    body = _body(data, Kind.WEIGHTS)
+    (version,) = _fields(_WEIGHTS, body)
+    return Weights(version, bytes(body[_WEIGHTS.size :]))
 
 
 def unpack_description(data: bytes) -> Description:

@@ -1,9 +1,9 @@
 """The way that the dissertation's earlier implementation went: SSH for commands, SFTP for images, a process for each robot.
 
 OpenSSH's own client and server, with a server of our own on loopback: its own port, keys and configuration in a temporary
-folder, which accepts one key. At each step a robot's process sends the action over SSH; the program there writes the image to
-the file system and says so; the image is fetched by SFTP and read. Two variants: connections that stay open all the time,
-which is the best that can be done this way, and new ones for each step.
+folder, which accepts one key. At each step a process for each robot sends the action over SSH; the program there writes the
+image to the file system and says so; the image is fetched by SFTP and read. Two variants: connections that stay open all the
+time, which is the best that can be done this way, and new ones for each step.
 """
 
 from __future__ import annotations

@@ -1,0 +1,77 @@
+"""The policy on the robot: weights come from the server, the robot proposes, the server overrides."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from remote.field import Field, drive
+
+from tutelage.policies.ensemble import EnsemblePolicy
+from tutelage.remote.fleet import RemoteFleet
+from tutelage.remote.weights import SharedPolicy
+
+Policies = tuple[RemoteFleet, SharedPolicy, EnsemblePolicy]
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
+    pytest.importorskip("zenoh", reason="needs the extra sgc")
+    with Field(tmp_path_factory.mktemp("field"), 1) as made:
+        made.router()
+        made.robots[1] = made.robot(1, "--hz", 20, "--policy", "--no-cameras")
+        yield made
+
+
+@pytest.fixture
+def policies(field: Field) -> Iterator[Policies]:
+    fleet = RemoteFleet.connect(field.server, hz=20.0)
+    try:
+        fleet.reset()
+        policy = EnsemblePolicy((2,), fleet.action_low, fleet.action_high, members=2, hidden=(8,), seed=3)
+        shared = SharedPolicy(fleet, policy)
+        still = np.zeros((1, 2), np.float32)
+        drive(lambda: fleet.step(still), lambda: fleet.proposals()[1][0] == 1)
+        yield fleet, shared, policy
+    finally:
+        fleet.close()
+
+
+def test_a_robot_proposes_what_the_policy_says_and_goes_on_by_itself(field: Field, policies: Policies) -> None:
+    fleet, shared, policy = policies
+    began = time.monotonic()
+    obs = fleet.step(np.zeros((1, 2), np.float32))[0]
+    for _ in range(15):
+        action = shared.act(obs)
+        assert action == pytest.approx(policy.act(obs), abs=1e-5)
+        obs, *_, info = fleet.step(action)
+    assert info["online"].all()
+    acts = field.notes(1, began + 0.2, "act")
+    assert len(acts) > 5
+    assert tuple(map(float, acts[-1].words)) == pytest.approx(tuple(policy.act(obs)[0]), abs=0.05)
+
+
+def test_new_weights_are_swapped_in_while_the_robot_works(policies: Policies) -> None:
+    fleet, shared, policy = policies
+    for member in policy.net.parameters():
+        member.data.mul_(0.5)
+    policy.forget()
+    shared.share()
+    assert shared.version == 2
+    obs = fleet.step(np.zeros((1, 2), np.float32))[0]
+    assert shared.act(obs) == pytest.approx(policy.act(obs), abs=1e-5)  # until they arrive, what the server would do
+    drive(lambda: fleet.step(shared.act(fleet._obs)), lambda: fleet.proposals()[1][0] == 2)
+    obs = fleet.step(shared.act(fleet._obs))[0]
+    assert fleet.proposals()[0] == pytest.approx(policy.act(obs), abs=1e-5)
+
+
+def test_the_server_overrides(field: Field, policies: Policies) -> None:
+    fleet, _, _ = policies
+    for _ in range(3):
+        fleet.step(np.array([[0.125, -0.25]], np.float32))
+    began = time.monotonic()
+    for _ in range(5):
+        fleet.step(np.array([[0.125, -0.25]], np.float32))
+    assert {note.words for note in field.notes(1, began, "act")} == {("0.125", "-0.25")}
