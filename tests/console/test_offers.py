@@ -82,7 +82,8 @@ class TestOffers:
         offers.join("ann", 0.0)
         ask(offers, 0)
         assert ask(offers, now=1.0) == []
-        assert offers.queue() == [{"robot": 0, "reason": "uncertain", "since": 0.0, "offered_to": "ann"}]
+        waiting = {"robot": 0, "reason": "uncertain", "since": 0.0, "offered_to": "ann", "expires_in": 14.0}
+        assert offers.queue(1.0) == [waiting]
         assert offers.accept("ann", 0, 2.0).reason == "uncertain"
 
 

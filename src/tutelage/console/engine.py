@@ -327,7 +327,7 @@ class Recording:
         """The fleet as it is. Call it with the lock."""
         engine, offers = self._engine, self._engine.offers
         n, now = loop.fleet.num_envs, engine.clock()
-        queue = offers.queue()
+        queue = offers.queue(now)
         rank, reason = np.full(n, -1), [""] * n
         for place, row in enumerate(queue):
             rank[row["robot"]], reason[row["robot"]] = place, row["reason"]
@@ -337,7 +337,10 @@ class Recording:
             held[robot] = engine.people.silent(robot)
             reason[robot] = hold.lease.reason
             lease = hold.lease
-            leases[robot] = {"operator": lease.operator, "id": lease.id, "since": lease.since, "held": bool(held[robot])}
+            leases[robot] = {
+                "operator": lease.operator, "id": lease.id, "since": lease.since, "held": bool(held[robot]),
+                "reason": lease.reason,
+            }  # fmt: skip
         for robot in np.flatnonzero(loop.violation).tolist():
             reason[robot] = "violated"
         stopped = engine.parts.fleet.latched

@@ -325,13 +325,15 @@ class Offers:
             robots[hold.human] = robot
         return robots
 
-    def queue(self) -> list[dict[str, Any]]:
-        """The requests, first one first."""
+    def queue(self, now: float) -> list[dict[str, Any]]:
+        """The requests, first one first. expires_in: seconds, of those that are offered to somebody."""
         rows = []
         for robot in self.order:
             asking, offer = self.asking[robot], self.offers.get(robot)
             to = self._seat(offer.human).operator if offer else None
-            rows.append({"robot": robot, "reason": asking.reason, "since": self._wall(asking.since), "offered_to": to})
+            left = max(0.0, self.terms.offer - (now - offer.since)) if offer else None
+            row = {"robot": robot, "reason": asking.reason, "since": self._wall(asking.since)}
+            rows.append({**row, "offered_to": to, "expires_in": left})
         return rows
 
     def free_people(self) -> int:

@@ -105,8 +105,9 @@ class Snapshot:
         rank: place in the queue, 0 first, or -1.
         online, stopped: bool; stopped: an emergency stop that nobody cleared yet.
         held: bool, a person has the robot and gives no fresh command, so it stands still.
-        queue: requests, first one first: {robot, reason, since (seconds since 1970), offered_to (a name or None)}.
-        leases: by robot: {operator, id, since, held}.
+        queue: requests, first one first: {robot, reason, since (seconds since 1970), offered_to (a name or None), expires_in
+            (seconds, or None)}.
+        leases: by robot: {operator, id, since, held, reason}.
         policy_version: how often the policy's weights were replaced.
         tick: seconds that the timestep took; late: how much too late it began, s.
     """
