@@ -222,6 +222,18 @@ class TestHandOver:
         assert denied.value.code == code
 
 
+class TestComingBack:
+    def test_one_is_told_again_what_one_has_and_is_offered(self) -> None:
+        offers = desk()
+        offers.join("ann", 0.0)
+        offers.join("bob", 0.0)
+        assert offers.standing("ann", 0.0) == offers.standing("zoe", 0.0) == []
+        lease = offers.take("ann", 1, 1.0)
+        ask(offers, 2, now=1.0)
+        assert offers.standing("ann", 2.0) == [LeaseGranted("ann", lease)]
+        assert offers.standing("bob", 3.0) == [Offer("bob", 2, "uncertain", 13.0)]
+
+
 class TestSeats:
     def test_when_all_are_taken_nobody_else_gets_one(self) -> None:
         offers = desk(seats=1)

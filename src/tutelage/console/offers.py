@@ -336,11 +336,15 @@ class Offers:
             rows.append({**row, "offered_to": to, "expires_in": left})
         return rows
 
-    def free_people(self) -> int:
-        """How many people are there, want offers, and have neither robot nor offer."""
-        return sum(
-            1 for j, seat in enumerate(self.seats) if seat and seat.present and seat.available and not self._engaged(j)
-        )
+    def standing(self, operator: str, now: float) -> list[Told]:
+        """What somebody who comes back must be told again: their lease, and what is offered to them."""
+        j = self._find(operator)
+        told: list[Told] = [LeaseGranted(operator, hold.lease) for hold in self.holds.values() if hold.human == j]
+        for pending in (self.offers, self.passing):
+            for robot, offer in pending.items():
+                if offer.human == j:
+                    told.append(Offer(operator, robot, offer.reason, max(0.0, self.terms.offer - (now - offer.since))))
+        return told
 
     # -- inside -------------------------------------------------------------------------------------------------
 

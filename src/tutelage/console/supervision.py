@@ -150,6 +150,12 @@ class Supervision:
         self.engine.parts.fleet.clear(robots)
         self.engine.remember_stops("estop_clear", operator, robots)
 
+    def standing(self, operator: str) -> list[Told]:
+        """What somebody who comes back must be told again: `LeaseGranted` of the robot they have, `Offer` of what is offered
+        to them, for as long as it still is."""
+        with self.engine.lock:
+            return self.engine.offers.standing(operator, self.engine.clock())
+
     # -- what there is to see -----------------------------------------------------------------------------------
 
     def snapshot(self) -> Snapshot:
