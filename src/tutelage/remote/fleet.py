@@ -187,6 +187,26 @@ class RemoteFleet(Fleet):
         return self._description
 
     @property
+    def robots(self) -> tuple[str, ...]:
+        """Their names, (N,)."""
+        return self.names
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of each robot's cameras."""
+        return self.description.cameras
+
+    @property
+    def dt(self) -> float:
+        """Seconds of a timestep of a robot."""
+        return self.description.dt
+
+    @property
+    def paces(self) -> bool:
+        """Whether `step_wait` sleeps to the next tick."""
+        return self.hz is not None
+
+    @property
     def deadline(self) -> float:
         """Seconds without an observation after which a robot is out of reach."""
         return max(self._deadline, 3 * self._description.dt) if self._description is not None else self._deadline
