@@ -102,6 +102,11 @@ class Socket:
         """The next message of a type (and with these fields); others are kept in `seen`."""
         return self.hear_any((type,), timeout, **fields)
 
+    def heard(self, type: str, **fields: Any) -> dict[str, Any]:
+        """The same, if it did not come before."""
+        before = [m for m in self.seen if m["type"] == type and fields.items() <= m.items()]
+        return before[-1] if before else self.hear(type, **fields)
+
     def hear_any(self, types: Sequence[str], timeout: float = 5.0, **fields: Any) -> dict[str, Any]:
         """The same for several types."""
         deadline = time.monotonic() + timeout

@@ -44,6 +44,7 @@ class SmallSupervision(Supervision):
         self.offered: dict[int, str] = {}
         self.stopped = np.zeros(robots, dtype=bool)
         self.shape = (180, 320)
+        self.sent = b""
         self._lock = threading.RLock()
         self._told: list[Callable[[Told], None]] = []
         self._ids = itertools.count(1)
@@ -79,6 +80,13 @@ class SmallSupervision(Supervision):
             for robot, lease in list(self.leases.items()):
                 if lease.operator == operator:
                     self._finish(robot, "lost")
+
+    def standing(self, operator: str) -> list[Told]:
+        with self._lock:
+            mine: list[Told] = [
+                LeaseGranted(operator, lease) for lease in self.leases.values() if lease.operator == operator
+            ]
+            return mine + [Offer(operator, robot, "uncertain", 5.0) for robot, to in self.offered.items() if to == operator]
 
     def available(self, operator: str, yes: bool) -> None:
         self.note(operator, "available", None, yes=yes)
@@ -173,11 +181,14 @@ class SmallSupervision(Supervision):
         picture = np.full((*self.shape, 3), (40 * robot, 100, 200), dtype=np.uint8)
         return Frame(self._t / self.description.hz, picture)
 
+    def jpeg(self, robot: int, camera: int) -> tuple[float, bytes] | None:
+        return (self._t / self.description.hz, self.sent) if self.sent else None
+
     def metrics(self, since: int = 0) -> list[dict[str, Any]]:
         return [{"t": t, "successes": t // 10, "rohe": float("nan")} for t in range(since + 1, self._t + 1)]
 
     def operators(self) -> list[dict[str, Any]]:
-        return [{"name": name, "interventions": 0} for name in self.seats]
+        return [{"operator": name, "interventions": 0} for name in list(self.seats)[:1]]
 
     def episodes(self, limit: int = 100) -> list[dict[str, Any]]:
         return [{"id": 1, "robot": 0, "operator": "ana", "began": 0.0, "seconds": 1.0, "outcome": "given_back", "frames": 2}]

@@ -158,6 +158,16 @@ def test_what_is_not_possible_is_told(running: Running, message: dict[str, objec
         assert error["text"]
 
 
+def test_everybody_who_may_help_is_listed(running: Running) -> None:
+    with running.socket("ana") as ana, running.socket("viewer") as viewer:
+        ana.hear("hello")
+        viewer.hear("hello")
+        with contextlib.closing(running.client("operator")) as client, running.socket("operator") as other:
+            other.hear("hello")
+            rows = client.get("/api/operators").json()["rows"]
+    assert {(row["name"], row["operator"], row["online"]) for row in rows} == {(n, n, True) for n in ("ana", "operator")}
+
+
 def test_events_go_to_those_they_are_for(running: Running) -> None:
     with running.socket("ana") as ana, running.socket("operator") as other:
         ana.hear("hello")

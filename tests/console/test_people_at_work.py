@@ -60,7 +60,7 @@ def test_of_two_people_who_grab_one_robot_one_has_it(floor: Running) -> None:
         assert sorted(answer["type"] for answer in answers) == ["ack", "error"]
         assert next(answer for answer in answers if answer["type"] == "error")["code"] == "taken"
         (winner,) = [socket for socket, answer in zip((ana, other), answers, strict=True) if answer["type"] == "ack"]
-        lease = winner.hear("lease", robot=0)["id"]
+        lease = winner.heard("lease", robot=0)["id"]
         state = winner.hear("state")
         while "0" not in state["leases"]:
             state = winner.hear("state")

@@ -11,9 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from consoles import Running, Socket
+from hypothesis import given
+from hypothesis import strategies as st
 
-from tutelage.console.pictures import fitted, jpeg
+from tutelage.console.pictures import fitted, jpeg, size_of
 from tutelage.console.video import HEADER
+from tutelage.errors import TutelageError
 
 STREAM = {"robot": 1, "camera": 0, "width": 320, "height": 180, "fps": 20}
 
@@ -146,3 +149,37 @@ def test_pictures_keep_their_shape() -> None:
     assert fitted(rgb, 320, 180).shape == (180, 135, 3)
     assert fitted(rgb, 4000, 4000) is rgb
     assert cv2.imdecode(np.frombuffer(jpeg(rgb), np.uint8), cv2.IMREAD_COLOR).shape == (400, 300, 3)
+
+
+def test_a_jpeg_from_a_robot_is_passed_on_as_it_came_or_made_smaller(running: Running) -> None:
+    rgb = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    running.supervision.sent = jpeg(rgb)
+    try:
+        with running.socket("viewer", "/api/video") as video:
+            video.say("watch", streams=[STREAM, STREAM | {"width": 100, "height": 100}])
+            seen = {header[2:4]: header[-1] for header in pictures(video, 0.6)}
+        assert seen.keys() == {(320, 240), (100, 75)}
+        assert seen[320, 240] == running.supervision.sent
+    finally:
+        running.supervision.sent = b""
+
+
+@pytest.mark.parametrize(
+    "content", [b"GIF89a" * 10, b"\xff\xd8", b"\xff\xd8\xff\xc0\x00\x00", b"\xff\xd8" + b"\xff\xe0\x00\x00" * 30]
+)
+def test_what_is_no_jpeg_is_told(running: Running, content: bytes) -> None:
+    running.supervision.sent = content
+    try:
+        with running.socket("viewer", "/api/video") as video:
+            video.say("watch", streams=[STREAM])
+            assert json.loads(video.connection.recv(5))["code"] == "no_picture"
+    finally:
+        running.supervision.sent = b""
+
+
+@given(st.binary(max_size=40) | st.binary(max_size=40).map(lambda tail: b"\xff\xd8\xff" + tail))
+def test_any_bytes_have_a_size_or_are_no_jpeg(content: bytes) -> None:
+    with contextlib.suppress(TutelageError):
+        width, height = size_of(content)
+        assert width > 0
+        assert height > 0

@@ -55,9 +55,9 @@ async def operators(request: Request, who: Anybody) -> dict[str, Any]:
     """What each person has done, and who is here."""
     c, hub = context_of(request), request.app.state.hub
     rows = plain(await c.slow.run(c.supervision.operators))
-    for row in rows:
-        row["online"] = row.get("name") in hub.names
-    return {"rows": rows}
+    known = {row["operator"] for row in rows}
+    rows += [{"operator": name} for name in sorted(hub.operators - known)]
+    return {"rows": [row | {"name": row["operator"], "online": row["operator"] in hub.operators} for row in rows]}
 
 
 @router.get("/api/audit")

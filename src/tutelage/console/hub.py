@@ -22,6 +22,10 @@ class Listener(Protocol):
 
     name: str
 
+    @property
+    def helps(self) -> bool:
+        """Whether the person may help robots."""
+
     def tell(self, message: str) -> None:
         """An event: each one counts."""
 
@@ -45,21 +49,6 @@ def message_of(event: Told) -> dict[str, Any] | None:
     return None
 
 
-def waiting_for(name: str, snapshot: Snapshot) -> list[dict[str, Any]]:
-    """What somebody who comes back must know: the robots they hold, and those that are offered to them."""
-    mine: list[dict[str, Any]] = [
-        {"type": "lease", "robot": robot, "id": lease["id"], "reason": lease.get("reason", "asked")}
-        for robot, lease in snapshot.leases.items()
-        if lease["operator"] == name
-    ]
-    offers: list[dict[str, Any]] = [
-        {"type": "offer", "robot": row["robot"], "reason": row["reason"], "expires_in": row.get("expires_in")}
-        for row in snapshot.queue
-        if row["offered_to"] == name
-    ]
-    return mine + offers
-
-
 class Hub:
     """All live sockets. For the event loop's thread only, but for what the supervision calls.
 
@@ -79,9 +68,9 @@ class Hub:
         self._unsubscribe: Callable[[], None] = lambda: None
 
     @property
-    def names(self) -> set[str]:
-        """Who has a live socket."""
-        return set(self._names)
+    def operators(self) -> set[str]:
+        """Who has a live socket and may help robots."""
+        return {listener.name for listener in self._listeners if listener.helps}
 
     def counts(self) -> dict[str, float]:
         """For /metrics."""
@@ -106,12 +95,12 @@ class Hub:
             with contextlib.suppress(asyncio.CancelledError):
                 await self._task
 
-    async def join(self, listener: Listener, seated: bool) -> str | None:
-        """A socket opens. seated: the person wants a seat. Returns why they have none, or None."""
+    async def join(self, listener: Listener) -> str | None:
+        """A socket opens; who may help takes a seat. Returns why they have none, or None."""
         async with self._lock(listener.name):
             self._listeners.add(listener)
             self._names[listener.name] += 1
-            return await self.sit(listener.name) if seated else None
+            return await self.sit(listener.name) if listener.helps else None
 
     async def sit(self, name: str) -> str | None:
         """Take a seat, if there is one. Returns why there is none, or None."""

@@ -13,7 +13,7 @@ from tutelage.console import messages
 from tutelage.console.accounts import Role, Session
 from tutelage.console.context import log
 from tutelage.console.fleet_api import describe
-from tutelage.console.hub import Hub, state_message, waiting_for
+from tutelage.console.hub import Hub, message_of, state_message
 from tutelage.console.limits import Bucket
 from tutelage.console.plain import plain, text
 from tutelage.console.sockets import Socket, error
@@ -39,6 +39,10 @@ class LiveSocket(Socket):
         self._delays: deque[float] = deque(maxlen=500)
         self._commands = self._dropped = 0
         self._next_link = time.monotonic() + 1
+
+    @property
+    def helps(self) -> bool:
+        return self.session.role >= Role.OPERATOR
 
     # -- to the page --------------------------------------------------------------------------------------------
 
@@ -66,14 +70,14 @@ class LiveSocket(Socket):
 
     async def begin(self) -> None:
         supervision = self.context.supervision
-        no_seat = await self.hub.join(self, self.session.role >= Role.OPERATOR)
+        no_seat = await self.hub.join(self)
         newest = supervision.snapshot()
         rows = await self.context.slow.run(supervision.metrics, max(0, newest.t - 10**9))
         me = {"name": self.name, "role": self.session.role.name.lower(), "seat": self.hub.seats.get(self.name)}
         hello = {"type": "hello", "me": me, "fleet": describe(self.websocket.app), "metrics": plain(rows[-HISTORY:])}
-        # What was told while it joined comes after hello.
-        waiting = [text(message) for message in waiting_for(self.name, newest)]
-        self._events.extendleft(reversed([text(hello | {"server_time": time.time()}), *waiting]))
+        standing = [text(message_of(event)) for event in supervision.standing(self.name)]
+        # What was told while it joined comes after hello, and may be among what stands.
+        self._events = deque([text(hello | {"server_time": time.time()}), *standing, *self._events])
         self.show(state_message(newest))
         if no_seat:
             self.refuse("no_seat", no_seat)
@@ -102,7 +106,7 @@ class LiveSocket(Socket):
         if isinstance(said, messages.Ping):
             self.tell(text({"type": "pong", "n": said.n, "time": said.time, "server_time": time.time()}))
             return
-        if self.session.role < Role.OPERATOR:
+        if not self.helps:
             self.refuse("forbidden", "viewers look only", said.ref)
             return
         try:

@@ -18,7 +18,7 @@ from starlette.websockets import WebSocket
 from tutelage.console import messages
 from tutelage.console.accounts import Session
 from tutelage.console.context import Context, Pool, log
-from tutelage.console.pictures import fitted, jpeg
+from tutelage.console.pictures import decoded, fitted, jpeg, size_of
 from tutelage.console.sockets import Socket, error
 from tutelage.errors import TutelageError
 
@@ -115,11 +115,29 @@ class Video:
 
     def _picture(self, key: Key, last: float) -> Picture | None:
         robot, camera, width, height = key
+        sent = self.context.supervision.jpeg(robot, camera)
+        if sent is not None:
+            return _passed_on(*sent, last, width, height)
         frame = self.context.supervision.frame(robot, camera, width, height)
         if frame is None or frame.time == last:
             return None
         rgb = fitted(frame.rgb, width, height)
         return Picture(frame.time, rgb.shape[1], rgb.shape[0], jpeg(rgb))
+
+
+def _passed_on(time_: float, content: bytes, last: float, width: int, height: int) -> Picture | None:
+    """The JPEG of a robot: as it came, unless it is much larger than what is asked for. None: it is not a new one.
+
+    Raises:
+        TutelageError: it is no JPEG.
+    """
+    if time_ == last:
+        return None
+    shape = size_of(content)
+    if shape[0] > 1.5 * width or shape[1] > 1.5 * height:
+        rgb = fitted(decoded(content), width, height)
+        return Picture(time_, rgb.shape[1], rgb.shape[0], jpeg(rgb))
+    return Picture(time_, *shape, content)
 
 
 class VideoSocket(Socket):
