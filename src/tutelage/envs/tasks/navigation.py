@@ -5,6 +5,8 @@ The 2-D navigation of implicit interactive fleet learning (section 6.5 of the di
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,6 +37,8 @@ def _walls() -> NDArray[np.bool_]:
 
 WALLS = _walls()
 """Whether each cell (x, y) is wall, (100, 61)."""
+_DOT = 1.5
+"""Radius of the robot in pictures."""
 FLOOR, WALL, WIND, FINISH, ROBOT = np.array(
     [[236, 236, 230], [70, 74, 84], [206, 224, 242], [120, 190, 110], [214, 70, 50]], dtype=np.uint8
 )
@@ -77,12 +81,23 @@ class Navigation(ArrayTask):
         return np.asarray(np.square(state - GOAL).sum(axis=1) <= GOAL_RADIUS**2)
 
     def draw(self, state: Array, width: int, height: int) -> NDArray[np.uint8]:
-        x = (np.arange(width) + 0.5) / width * SIZE[0] - 0.5
-        y = SIZE[1] - (np.arange(height) + 0.5) / height * SIZE[1] - 0.5  # +y is up
-        cell = np.ix_(np.rint(x).astype(int), np.rint(y).astype(int))
-        points = np.stack(np.meshgrid(x, y), axis=-1)
-        floor = np.where(((points[..., 0] >= WINDY[0]) & (points[..., 0] <= WINDY[1]))[..., None], WIND, FLOOR)
-        floor = np.where((np.linalg.norm(points - GOAL, axis=-1) <= GOAL_RADIUS)[..., None], FINISH, floor)
-        maze = np.where(WALLS[cell].T[..., None], WALL, floor)
-        near = np.square(points - state[:, None, None]).sum(axis=-1) <= 1.5**2
-        return np.asarray(np.where(near[..., None], ROBOT, maze))
+        x, y, maze = _maze(width, height)
+        pictures = np.repeat(maze[None], len(state), axis=0)
+        for picture, (robot_x, robot_y) in zip(pictures, state, strict=True):
+            rows, columns = np.flatnonzero(np.abs(y - robot_y) <= _DOT), np.flatnonzero(np.abs(x - robot_x) <= _DOT)
+            near = np.square(x[columns] - robot_x) + np.square(y[rows] - robot_y)[:, None] <= _DOT**2
+            part = np.ix_(rows, columns)
+            picture[part] = np.where(near[..., None], ROBOT, picture[part])
+        return pictures
+
+
+@functools.cache
+def _maze(width: int, height: int) -> tuple[Array, Array, NDArray[np.uint8]]:
+    """The x of a picture's columns, the y of its rows, and the maze without a robot, (height, width, 3)."""
+    x = (np.arange(width) + 0.5) / width * SIZE[0] - 0.5
+    y = SIZE[1] - (np.arange(height) + 0.5) / height * SIZE[1] - 0.5  # +y is up
+    cell = np.ix_(np.rint(x).astype(int), np.rint(y).astype(int))
+    points = np.stack(np.meshgrid(x, y), axis=-1)
+    floor = np.where(((points[..., 0] >= WINDY[0]) & (points[..., 0] <= WINDY[1]))[..., None], WIND, FLOOR)
+    floor = np.where((np.linalg.norm(points - GOAL, axis=-1) <= GOAL_RADIUS)[..., None], FINISH, floor)
+    return x, y, np.asarray(np.where(WALLS[cell].T[..., None], WALL, floor))
