@@ -200,7 +200,7 @@ def _opposite(blocks: Array) -> Array:
     return np.asarray(-blocks * np.clip(far, RING - 0.01, RING + 0.01) / np.maximum(far, 1e-9))
 
 
-@functools.cache
+@functools.lru_cache(16)
 def _background(width: int, height: int) -> NDArray[np.uint8]:
     """The empty table, (height, width, 3)."""
     scale = min(width, height) / (2 * _VIEW)

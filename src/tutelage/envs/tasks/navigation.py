@@ -91,7 +91,7 @@ class Navigation(ArrayTask):
         return pictures
 
 
-@functools.cache
+@functools.lru_cache(16)
 def _maze(width: int, height: int) -> tuple[Array, Array, NDArray[np.uint8]]:
     """The x of a picture's columns, the y of its rows, and the maze without a robot, (height, width, 3)."""
     x = (np.arange(width) + 0.5) / width * SIZE[0] - 0.5
