@@ -167,7 +167,6 @@ function receive(message: ServerMessage): void {
       break;
     case "state":
       store.applySnapshot(message);
-      adoptLease();
       break;
     case "offer":
       offered(message.robot, message.reason, message.expires_in);
@@ -210,7 +209,7 @@ function receive(message: ServerMessage): void {
         waiting.delete(String(message.ref));
         entry.reject(new Refused(message.code, message.text));
       } else if (message.code === "stale_lease" || message.code === "not_yours") {
-        if (store.lease.value) ended(store.lease.value.robot, "expired");
+        doubt();
       } else {
         store.note(message.text || message.code, "warning");
       }
@@ -246,20 +245,22 @@ function offered(robot: number, reason: Reason, expiresIn: number | null): void 
 function ended(robot: number, why: string): void {
   const mine = store.lease.value?.robot === robot;
   batch(() => {
-    if (mine) store.lease.value = null;
+    if (mine) {
+      store.lastEnd.value = why;
+      store.lease.value = null;
+    }
     forgetRobot(robot);
     if (mine) store.note(`${store.robotName(robot)}: ${endingText(why)}`, why === "expired" || why === "lost" ? "warning" : "info");
   });
 }
 
-/** A page that was loaded again learns from the state which robot it still holds; and drops what the state says is gone. */
-function adoptLease(): void {
-  const state = store.snapshot.value;
-  const name = store.me.value?.name;
-  if (!state || !name || store.lease.value) return;
-  for (const [robot, row] of Object.entries(state.leases)) {
-    if (row.operator === name && row.id) store.lease.value = { robot: Number(robot), id: row.id };
-  }
+/** A heartbeat was refused. Mostly the news of why is on its way; where none comes, the lease is over all the same. */
+function doubt(): void {
+  const held = store.lease.value;
+  if (!held) return;
+  window.setTimeout(() => {
+    if (store.lease.value?.id === held.id) ended(held.robot, "expired");
+  }, 1500);
 }
 
 /** The text that screen readers say at once. */

@@ -92,6 +92,7 @@ effect(() => {
 followLease();
 
 // Whoever gets a robot looks at it; whoever is done with one looks at the fleet again.
+const DONE = new Set(["given_back", "handed_over", "completed"]);
 let drove: number | null = null;
 effect(() => {
   const robot = store.lease.value?.robot ?? null;
@@ -99,8 +100,7 @@ effect(() => {
     if (robot === drove) return;
     if (robot !== null) go(`/robot/${robot}`);
     else if (drove !== null && store.connection.value.kind === "open" && route.value.page === "robot" && route.value.id === String(drove)) {
-      const look = store.robots.value[drove]?.value.look;
-      if (look !== "stopped" && look !== "violated" && look !== "offline") go("/");
+      if (DONE.has(store.lastEnd.value)) go("/");
     }
     drove = robot;
   });

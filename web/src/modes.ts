@@ -25,10 +25,11 @@ export function lookOfMode(mode: number): Look {
 }
 
 /** A stop outranks everything, and a robot that is off the air is offline whatever it did last. */
-export function lookOf(mode: number, online: boolean, stopped: boolean, held = false, asking = false): Look {
+export function lookOf(mode: number, online: boolean, stopped: boolean, held = false, asking = false, fallen = false): Look {
   if (stopped) return "stopped";
   if (!online) return "offline";
   const look = lookOfMode(mode);
+  if (fallen && look === "switching") return "violated"; // somebody is with it, and it still lies there
   if (held && look === "driven") return "held";
   return asking && look === "auto" ? "asking" : look;
 }

@@ -110,8 +110,11 @@ export type ServerMessage =
   | { type: "link"; command_latency_ms: { p50: number | null; p99: number | null }; dropped: number };
 
 export interface OperatorRow {
-  name: string;
+  operator: string;
+  /** Whether they have a page open. */
   online?: boolean;
+  /** Whether they have a seat and are there. */
+  present?: boolean;
   robot?: number | null;
   available?: boolean;
   [statistic: string]: unknown;

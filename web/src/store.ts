@@ -38,6 +38,8 @@ export const metrics = signal<MetricsRow[]>([]);
 export const offers = signal<ReadonlyMap<number, { reason: Reason; until: number; seconds: number }>>(new Map());
 /** The robot that this person drives, and the lease's id. */
 export const lease = signal<{ robot: number; id: string } | null>(null);
+/** Why the last one ended. */
+export const lastEnd = signal("");
 /** Robots that this person asked for and does not have yet. */
 export const asked = signal<ReadonlySet<number>>(new Set());
 export const available = signal(true);
@@ -131,7 +133,7 @@ export function applySnapshot(next: Snapshot): void {
         index,
         name: old.name,
         mode,
-        look: lookOf(mode, online, stopped, held, row !== undefined),
+        look: lookOf(mode, online, stopped, held, row !== undefined, next.reason[index] === "violated"),
         reason: row?.reason || next.reason[index] || "",
         rank: next.rank[index] ?? -1,
         online,

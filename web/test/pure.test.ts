@@ -45,6 +45,7 @@ describe("a robot's look", () => {
     expect(lookOf(2, false, false)).toBe("offline");
     expect(lookOf(2, true, false, true)).toBe("held");
     expect(lookOf(0, true, false, false, true)).toBe("asking");
+    expect(lookOf(1, true, false, false, false, true)).toBe("violated");
     expect(lookOf(3, true, false, false, true)).toBe("violated");
   });
 });

@@ -43,8 +43,7 @@ export function Audit() {
     }
   };
   useEffect(() => {
-    const timer = window.setTimeout(() => void load(null), 200);
-    return () => window.clearTimeout(timer);
+    void load(null);
   }, [filters.kind, filters.who, filters.robot]);
 
   const verify = async (): Promise<void> => {
@@ -63,7 +62,7 @@ export function Audit() {
         <h1 class="head">Audit</h1>
         <label class="inline">
           <span class="quiet">Kind</span>
-          <input type="text" list="kinds" size={10} value={filters.kind} onInput={(event) => setFilters({ ...filters, kind: event.currentTarget.value.trim() })} />
+          <input type="text" list="kinds" size={10} value={filters.kind} onChange={(event) => setFilters({ ...filters, kind: event.currentTarget.value.trim() })} />
           <datalist id="kinds">
             {kinds.map((kind) => (
               <option key={kind} value={kind} />
@@ -72,7 +71,7 @@ export function Audit() {
         </label>
         <label class="inline">
           <span class="quiet">Who</span>
-          <input type="text" size={10} value={filters.who} onInput={(event) => setFilters({ ...filters, who: event.currentTarget.value.trim() })} />
+          <input type="text" size={10} value={filters.who} onChange={(event) => setFilters({ ...filters, who: event.currentTarget.value.trim() })} />
         </label>
         <label class="inline">
           <span class="quiet">Robot</span>

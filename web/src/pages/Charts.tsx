@@ -1,7 +1,7 @@
 /** How the fleet does, live. */
 
 import { signal } from "@preact/signals";
-import { clock, duration, number, percent, words } from "../format";
+import { clock, duration, milliseconds, number, percent, plural, words } from "../format";
 import { Chart } from "../parts/Chart";
 import type { MetricsRow } from "../protocol";
 import { metrics } from "../store";
@@ -30,6 +30,7 @@ const HIDDEN = new Set(["t", "time", ...KINDS.flatMap((kind) => kind.keys)]);
 
 const windows: [string, number][] = [["5 min", 300], ["30 min", 1800], ["All", Infinity]];
 const span = signal(300);
+const allShown = signal(false);
 
 export function Charts() {
   const rows = metrics.value;
@@ -46,7 +47,29 @@ export function Charts() {
   const first = rows[0]?.time ?? to;
   const from = Math.max(first, to - span.value);
   const more = Object.keys(last).filter((key) => !HIDDEN.has(key) && rows.some((row) => typeof row[key] === "number"));
-  const kinds = [...KINDS.filter((kind) => kind.keys.some((key) => key in last)), ...more.map((key): Kind => ({ keys: [key], title: words(key), say: "", format: number, tone: "tone-plain" }))];
+  const kinds = KINDS.filter((kind) => kind.keys.some((key) => key in last));
+  const others = more.map((key): Kind => ({ keys: [key], title: words(key), say: "", format: key.endsWith("_ms") ? milliseconds : number, tone: "tone-plain" }));
+  const grid = (which: Kind[]) => (
+    <div class="charts">
+      {which.map((kind) => {
+        const lines = kind.keys.map((key) => ({ name: words(key), tone: kind.tone, points: points(rows, key) }));
+        return (
+          <div key={kind.title} class="chart-cell" title={kind.say}>
+            <Chart
+              title={kind.title}
+              lines={lines}
+              format={kind.format}
+              formatX={(x) => (x >= to - 0.5 ? "now" : `−${clock(to - x)}`)}
+              from={from}
+              to={Math.max(to, from + 1)}
+              step={kind.step ?? lines.every((line) => line.points.every((point) => Number.isInteger(point.y)))}
+            />
+            {kind.say ? <p class="chart-say">{kind.say}</p> : null}
+          </div>
+        );
+      })}
+    </div>
+  );
   return (
     <section class="page">
       <div class="page-bar">
@@ -61,22 +84,13 @@ export function Charts() {
         </fieldset>
         <span class="quiet num">timestep {number(last.t)}</span>
       </div>
-      <div class="charts">
-        {kinds.map((kind) => (
-          <div key={kind.title} class="chart-cell" title={kind.say}>
-            <Chart
-              title={kind.title}
-              lines={kind.keys.map((key) => ({ name: words(key), tone: kind.tone, points: points(rows, key) }))}
-              format={kind.format}
-              formatX={(x) => (x >= to - 0.5 ? "now" : `−${clock(to - x)}`)}
-              from={from}
-              to={Math.max(to, from + 1)}
-              step={kind.step ?? false}
-            />
-            {kind.say ? <p class="chart-say">{kind.say}</p> : null}
-          </div>
-        ))}
-      </div>
+      {grid(kinds)}
+      {others.length ? (
+        <details class="numbers" open={allShown.value} onToggle={(event) => (allShown.value = event.currentTarget.open)}>
+          <summary>{plural(others.length, "more chart")}</summary>
+          {allShown.value ? grid(others) : null}
+        </details>
+      ) : null}
       <Table rows={rows} keys={kinds.flatMap((kind) => kind.keys)} />
     </section>
   );

@@ -11,8 +11,7 @@ export function Controls({ controls }: { controls: Description }) {
   const rest = controls.axes.map((_, k) => k).filter((k) => !stick || !stick.includes(k));
   return (
     <div class="controls">
-      {controls.help ? <p class="quiet">{controls.help}</p> : null}
-      {controls.pointer ? <p class="quiet">{POINTER[controls.pointer.kind] ?? ""}</p> : null}
+      {controls.help || controls.pointer ? <p class="quiet help">{controls.help || POINTER[controls.pointer?.kind ?? ""]}</p> : null}
       {controls.axes.length ? (
         <ul class="axes">
           {controls.axes.map((axis, k) => (
@@ -40,8 +39,8 @@ export function Controls({ controls }: { controls: Description }) {
 }
 
 const POINTER: Record<string, string> = {
-  push: "On the picture: press where to begin and drag to where it is to go; it moves when you let go.",
-  go: "On the picture: press and drag; the robot goes that way while you hold.",
+  push: "On the picture: press, drag the way it is to move, and let go.",
+  go: "On the picture: press where the robot is to go; it moves while you hold.",
   pick_place: "On the picture: press on what to pick and drag to where it is to be placed.",
 };
 
@@ -140,10 +139,12 @@ function Holds({ axis, k }: { axis: Axis; k: number }) {
         };
   const value = held.value.values[k] ?? 0;
   return (
-    <div class="hold">
-      <button type="button" tabIndex={-1} class={value < 0 ? "button on" : "button"} aria-label={`${axis.label}: less`} {...hold(-1)}>
-        −
-      </button>
+    <div class={axis.low < 0 || axis.toggle ? "hold" : "hold hold-one"}>
+      {axis.low < 0 || axis.toggle ? (
+        <button type="button" tabIndex={-1} class={value < 0 ? "button on" : "button"} aria-label={`${axis.label}: less`} {...hold(-1)}>
+          −
+        </button>
+      ) : null}
       <span>{axis.label}</span>
       <button type="button" tabIndex={-1} class={value > 0 ? "button on" : "button"} aria-label={`${axis.label}: more`} {...hold(1)}>
         +

@@ -17,7 +17,7 @@ export function written(key: string, value: unknown): string {
   return number(value);
 }
 
-const NOT_COLUMNS = new Set(["name", "online", "robot", "available", "seat", "role"]);
+const NOT_COLUMNS = new Set(["operator", "name", "present", "online", "robot", "available", "seat", "role"]);
 
 export function Operators() {
   const { data, error } = useLoad<{ rows: OperatorRow[] }>("/api/operators", 3);
@@ -47,8 +47,8 @@ export function Operators() {
             </thead>
             <tbody>
               {rows.map((row) => (
-                <tr key={row.name}>
-                  <th scope="row">{row.name}</th>
+                <tr key={row.operator}>
+                  <th scope="row">{row.operator}</th>
                   <td>{doing(row)}</td>
                   {columns.map((key) => (
                     <td key={key} class="num right">
@@ -66,10 +66,9 @@ export function Operators() {
 }
 
 function doing(row: OperatorRow): string {
-  const held = Object.entries(store.snapshot.value?.leases ?? {}).find(([, lease]) => lease.operator === row.name);
+  const held = Object.entries(store.snapshot.value?.leases ?? {}).find(([, lease]) => lease.operator === row.operator);
   const robot = typeof row.robot === "number" ? row.robot : held ? Number(held[0]) : null;
   if (robot !== null) return `drives ${store.robotName(robot)}`;
-  if (row.online === false) return "away";
-  if (row.available === false) return "on a break";
-  return row.online ? "free" : "–";
+  if (!row.online && !row.present) return "away";
+  return row.available === false ? "on a break" : "free";
 }

@@ -18,7 +18,7 @@ import { emergencyStop } from "../stop";
 import * as store from "../store";
 import { noStats, type ViewStats } from "../video";
 import { Controls } from "./Controls";
-import { Tile } from "./Wall";
+import { Tile, withWhom } from "./Wall";
 
 export function Stage({ index }: { index: number }) {
   const cell = store.robots.value[index];
@@ -52,8 +52,8 @@ function Known({ index }: { index: number }) {
           ←
         </a>
         <h1>{robot.name}</h1>
-        <Mode look={robot.look} note={robot.operator ? (mine ? "by you" : `by ${robot.operator}`) : undefined} />
-        {robot.reason && robot.look !== "auto" ? <span class="stage-reason">{reasonText(robot.reason)}</span> : null}
+        <Mode look={robot.look} note={withWhom(robot)} />
+        {robot.reason && robot.look !== "auto" && robot.reason !== robot.look ? <span class="stage-reason">{reasonText(robot.reason)}</span> : null}
         {cameras.length > 1 ? (
           <fieldset class="segments small cameras" aria-label="Camera">
             {cameras.map((name, k) => (
@@ -204,7 +204,7 @@ export function askReset(index: number): void {
     title: `Hard reset of ${store.robotName(index)}?`,
     body: (
       <p>
-        The robot is brought back to a start state by hand.
+        The robot is brought back to a start state.
         {t?.t_reset ? ` It takes ${duration(t.t_reset / t.hz)}, and the present episode ends.` : " The present episode ends."}
       </p>
     ),
@@ -239,18 +239,19 @@ function Actions({ index, mine }: { index: number; mine: boolean }) {
   );
   if (mine) {
     const resetting = robot.mode === ModeNumber.RESETTING;
+    const fallen = robot.reason === "violated" && !resetting;
     const since = store.snapshot.value?.leases[String(index)]?.since;
     return (
       <div class="actions">
         <p class="driving">
-          <strong>{resetting ? "Resetting" : robot.look === "held" ? "It holds: press something" : "You drive"}</strong>
+          <strong>{resetting ? "Resetting" : fallen ? "It needs a hard reset" : robot.held ? "It holds: press something" : "You drive"}</strong>
           {since !== undefined ? <span class="num">{clock(store.now.value + store.clockSync.offset - since)}</span> : null}
         </p>
         <div class="action-grid">
-          <button type="button" class="button primary" disabled={resetting} onClick={() => void giveBack(index)} aria-keyshortcuts="g">
+          <button type="button" class={`button ${fallen ? "" : "primary"}`} disabled={resetting} onClick={() => void giveBack(index)} aria-keyshortcuts="g">
             Give back <kbd>G</kbd>
           </button>
-          <button type="button" class="button" disabled={resetting} onClick={() => askReset(index)} aria-keyshortcuts="h">
+          <button type="button" class={`button ${fallen ? "primary" : ""}`} disabled={resetting} onClick={() => askReset(index)} aria-keyshortcuts="h">
             Hard reset… <kbd>H</kbd>
           </button>
           <HandOver index={index} />
@@ -296,7 +297,7 @@ function HandOver({ index }: { index: number }) {
   const load = (): void => {
     if (!element.current?.open) return;
     void get<{ rows: OperatorRow[] }>("/api/operators").then(
-      ({ rows }) => setPeople(rows.filter((row) => row.name !== store.me.value?.name && row.online !== false)),
+      ({ rows }) => setPeople(rows.filter((row) => row.operator !== store.me.value?.name && (row.online || row.present))),
       () => setPeople([]),
     );
   };
@@ -308,17 +309,17 @@ function HandOver({ index }: { index: number }) {
         {people?.length === 0 ? <p class="quiet">Nobody else is here.</p> : null}
         {people?.map((person) => (
           <button
-            key={person.name}
+            key={person.operator}
             type="button"
             class="button"
             onClick={() => {
               element.current?.removeAttribute("open");
-              void handOver(index, person.name).then((ok) => {
-                if (ok) store.note(`Offered to ${person.name}; you keep it until they accept.`);
+              void handOver(index, person.operator).then((ok) => {
+                if (ok) store.note(`Offered to ${person.operator}; you keep it until they accept.`);
               });
             }}
           >
-            {person.name}
+            {person.operator}
             {typeof person.robot === "number" ? <span class="quiet"> drives {store.robotName(person.robot)}</span> : null}
             {person.available === false ? <span class="quiet"> on a break</span> : null}
           </button>

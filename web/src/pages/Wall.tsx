@@ -94,7 +94,7 @@ export function Tile({ cell, fps, camera }: { cell: Signal<Robot>; fps: number; 
   const robot = cell.value;
   const [stats] = useState(() => signal<ViewStats>(noStats()));
   const needs = robot.rank >= 0 || robot.look === "violated";
-  const who = robot.operator ? (robot.operator === me.value?.name ? "by you" : `by ${robot.operator}`) : undefined;
+  const who = withWhom(robot);
   const quietLook = robot.look === "auto" || robot.look === "offline";
   return (
     <li class={`tile look-${robot.look} ${needs ? "tile-needs" : ""} ${quietLook ? "" : "tile-loud"}`}>
@@ -111,6 +111,13 @@ export function Tile({ cell, fps, camera }: { cell: Signal<Robot>; fps: number; 
       </a>
     </li>
   );
+}
+
+/** Who has it, in words that follow its state: "Driven by you", "Violated · with ana". */
+export function withWhom(robot: Robot): string | undefined {
+  if (!robot.operator) return undefined;
+  const person = robot.operator === me.value?.name ? "you" : robot.operator;
+  return robot.look === "violated" || robot.look === "switching" ? `with ${person}` : `by ${person}`;
 }
 
 /** A picture that has stopped says so. */
