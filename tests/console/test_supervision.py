@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -328,3 +329,74 @@ def knock_over(server: Serving) -> int:
     with server.of.engine.lock:
         fleet.falls[fleet.t + 2] = [3]  # type: ignore[attr-defined]
     return int(server.wait(lambda: [r for r in range(4) if server.now.mode[r] != Mode.AUTONOMOUS])[0])
+
+
+class TestCrowd:
+    def test_people_who_do_everything_at_once_do_not_stop_the_loop(self, tmp_path: Path) -> None:
+        """Threads ask for whatever comes to their minds; the loop goes on, and one robot has one holder."""
+        calls = (
+            "join",
+            "leave",
+            "accept",
+            "decline",
+            "take",
+            "give_back",
+            "reset",
+            "hand_over",
+            "available",
+            "estop",
+            "clear",
+        )
+        refused: list[str] = []
+
+        def one(server: Serving, seed: int, end: float) -> None:
+            rng = np.random.default_rng(seed)
+            while time.monotonic() < end:
+                name, robot = f"p{rng.integers(4)}", int(rng.integers(4))
+                call = calls[rng.integers(len(calls))]
+                lease = server.now.leases.get(robot)
+                try:
+                    if call in ("join", "leave"):
+                        getattr(server.of, call)(name)
+                    elif call == "hand_over":
+                        server.of.hand_over(name, robot, f"p{rng.integers(4)}")
+                    elif call == "available":
+                        server.of.available(name, bool(rng.integers(2)))
+                    elif call == "estop" and rng.random() < 0.05:
+                        server.of.estop(name, robot)
+                    elif call == "clear":
+                        server.of.clear_estop(name, robot) if server.now.stopped[robot] else None
+                    elif call not in ("estop", "clear"):
+                        getattr(server.of, call)(name, robot)
+                    for _ in range(3):
+                        if lease:
+                            server.of.command(
+                                lease["operator"], robot, lease["id"], time.monotonic_ns(), [rng.uniform(-1, 1)]
+                            )
+                except Denied as denied:
+                    refused.append(denied.code)
+                time.sleep(0.001)
+
+        with Serving(config(tmp_path, hz=200.0, humans=3)) as server:
+            t, end = server.now.t, time.monotonic() + 4.0
+            threads = [threading.Thread(target=one, args=(server, seed, end)) for seed in range(6)]
+            for thread in threads:
+                thread.start()
+            while time.monotonic() < end:
+                snapshot = server.now
+                holders = [lease["operator"] for lease in snapshot.leases.values()]
+                assert len(set(holders)) == len(holders)
+                humans = snapshot.human[snapshot.human >= 0].tolist()
+                assert len(set(humans)) == len(humans)
+                time.sleep(0.01)
+            for thread in threads:
+                thread.join()
+            assert server.of.healthy["ok"], server.of.healthy
+            assert server.now.t > t + 50
+        granted = [event.lease.id for event in server.told(LeaseGranted)]
+        ended = [event.lease for event in server.told(LeaseEnded)]
+        assert len(granted) > 20
+        assert sorted(granted) == sorted(ended), "each lease that began has ended, once"
+        assert set(refused) <= {
+            "no_seat", "not_offered", "not_yours", "taken", "offline", "stopped", "stale_lease", "too_many", "unknown_person",
+        }  # fmt: skip

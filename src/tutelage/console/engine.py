@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 import threading
 import time
 from collections import deque
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from tutelage.console.audit import Audit
 from tutelage.console.controls import Driver, controls_of
@@ -39,6 +41,8 @@ from tutelage.store import load_tree, save_tree, write_atomic
 
 _LOG = logging.getLogger(__name__)
 FOREVER = 10**12
+SWITCH = 0.0005
+"""Seconds after which a thread that computes lets another one go on: the loop is to be on time while pictures are made."""
 ENDED_BY = {
     Event.VIOLATE: "violated",
     Event.SUCCESS: "completed",
@@ -124,6 +128,8 @@ class Engine:
     def _build(self) -> None:
         config = self.config
         self.parts = parts = make_parts(config, self._report)
+        if config.learner != "inline":
+            torch.set_num_threads(1)  # a fleet's products are small, and threads that wait for each other are late
         fleet, run = parts.fleet, parts.config
         n = fleet.num_envs
         self.offers = Offers(n, run.humans, config.terms, self._log, self.wall)
@@ -192,6 +198,7 @@ class Engine:
 
     def start(self) -> None:
         """Let the loop run."""
+        sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH))
         self.herald.start()
         if isinstance(self.learner, ProcessLearner):
             self.learner.start()

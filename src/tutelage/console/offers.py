@@ -166,9 +166,11 @@ class Offers:
     # -- offers and leases --------------------------------------------------------------------------------------
 
     def accept(self, operator: str, robot: int, now: float) -> Lease:
-        """Take an offered robot, or one that its holder hands over."""
+        """Take an offered robot, or one that its holder hands over. Whoever has it already keeps it."""
         j = self._mine(operator)
         self._check(robot)
+        if robot in self.holds and self.holds[robot].human == j:
+            return self.holds[robot].lease
         passing = self.passing.get(robot)
         if passing and passing.human == j and robot in self.holds and robot not in self.resetting:
             reason = self.holds[robot].lease.reason

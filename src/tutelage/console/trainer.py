@@ -39,6 +39,8 @@ BACKLOG = 200
 """Timesteps that may wait for the learner; then the oldest are dropped."""
 MOST_OWED = 5000.0
 """Gradient steps that may be owed for new samples: when people teach faster than it learns, it catches up when they rest."""
+FETCH = 0.05
+"""Seconds between two looks at what there is to send."""
 RETRY = 2.0
 """Seconds until a learner that died is started again."""
 
@@ -91,7 +93,7 @@ class ProcessLearner:
         self._folder, self._acting, self._notice, self._swapped = folder, acting, notice, swapped
         self._numbers = [str(x) for x in (per_sample, swap_every, save_every)]
         self._lock = threading.Condition()
-        self._outbox: deque[bytes] = deque(maxlen=BACKLOG)
+        self._outbox: deque[Step] = deque(maxlen=BACKLOG)
         self._news: Tree | None = None
         self._closing = False
         self._process: subprocess.Popen[bytes] | None = None
@@ -125,16 +127,8 @@ class ProcessLearner:
 
     def record(self, step: Step) -> None:
         """Send a timestep on its way, for the critics."""
-        moved = step.moved
-        if not self._acting.critics:
-            return  # what people do is in the record
-        message: Tree = {"t": step.t}
-        for name in ("obs", "actions", "next_obs", "violation", "success", "truncated"):
-            message[name] = getattr(step, name)[moved]
-        content = pack(message)
-        with self._lock:
-            self._outbox.append(content)
-            self._lock.notify_all()
+        if self._acting.critics:  # what people do is in the record
+            self._outbox.append(step)
 
     def update(self, t: int) -> dict[str, float]:
         """Swap in the newest weights, if there are any; returns the losses that came with them."""
@@ -190,15 +184,12 @@ class ProcessLearner:
 
     def _write(self, connection: Connection, reader: threading.Thread) -> None:
         while True:
-            with self._lock:
-                self._lock.wait_for(lambda: self._outbox or self._closing or not reader.is_alive(), 1.0)
-                if self._closing or not reader.is_alive():
+            with self._lock:  # the loop wakes nobody: what it has to say is fetched
+                if self._lock.wait_for(lambda: self._closing or not reader.is_alive(), FETCH):
                     break
-                messages = list(self._outbox)
-                self._outbox.clear()
             try:
-                for message in messages:
-                    connection.send_bytes(message)
+                while self._outbox:
+                    connection.send_bytes(pack(_transitions(self._outbox.popleft())))
             except OSError:
                 break
         if self._closing:
@@ -323,6 +314,12 @@ class Training:
                 self._saved_at = now
                 with contextlib.suppress(TutelageError):  # the disk is full; the record still has all that matters
                     self.save()
+
+
+def _transitions(step: Step) -> Tree:
+    """What critics learn from: the transitions of the robots that moved."""
+    names = ("obs", "actions", "next_obs", "violation", "success", "truncated")
+    return {"t": step.t, **{name: getattr(step, name)[step.moved] for name in names}}
 
 
 def _step(message: Tree) -> Step:
