@@ -12,13 +12,13 @@ import pytest
 
 pytest.importorskip("zenoh", reason="needs the extra sgc")
 
-from floor import QUICK, LeaseEnded, Serving  # noqa: E402
-from remote.field import Field  # noqa: E402
+from floor import QUICK, LeaseEnded, Serving
+from remote.field import Field
 
-from tutelage.console.audit import samples_in  # noqa: E402
-from tutelage.console.states import Denied  # noqa: E402
-from tutelage.console.supervision import EngineConfig  # noqa: E402
-from tutelage.fleet.modes import Mode  # noqa: E402
+from tutelage.console.audit import samples_in
+from tutelage.console.states import Denied
+from tutelage.console.supervision import EngineConfig
+from tutelage.fleet.modes import Mode
 
 
 @pytest.fixture(scope="module")
