@@ -224,7 +224,7 @@ def refused(said: Said) -> str:
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
         (["run", "Walker2d", "--learner.schedule", "weekly"], "--learner.schedule"),
         (["info", "bogus"], "Expected one of ('tasks', 'levels', 'priorities', 'version')"),
-        (["check", "robot", "x"], "Expected one of ('env', 'policy', 'priority', 'supervisor')"),
+        (["check", "robot", "x"], "Expected one of ('env', 'policy', 'priority', 'supervisor', 'driver')"),
     ],
 )
 def test_what_cannot_be_parsed_is_one_line_that_names_it(

@@ -21,7 +21,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from tutelage import __version__
-from tutelage.console.commands import accounts, audit
+from tutelage.console.commands import accounts, audit, study
 from tutelage.console.commands.serve import serve
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.remote import commands as remote
@@ -127,7 +127,18 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
 
 def reproduce(
     what: Positional[
-        Literal["figure-2.3", "figure-A.1", "table-3.1", "table-3.2", "table-3.3", "gates", "figure-5.3", "figure-C.1"]
+        Literal[
+            "figure-2.3",
+            "figure-A.1",
+            "table-3.1",
+            "table-3.2",
+            "table-3.3",
+            "table-8.3",
+            "gates",
+            "figure-5.3",
+            "figure-5.5-remote",
+            "figure-C.1",
+        ]
     ],
     tasks: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
@@ -140,12 +151,13 @@ def reproduce(
 
     Args:
         what: figure-2.3 (LazyDAgger and its rivals), figure-A.1 (its sensitivity to its thresholds), table-3.1
-            (ThriftyDAgger and its rivals on peg insertion), table-3.3 (on cable routing from images), gates (all of them
-            with 100 robots and 10 humans), figure-5.3 (Fleet-DAgger's comparison, with table C.2), figure-C.1 (the
-            ablations of C.U.R.).
+            (ThriftyDAgger and its rivals on peg insertion), table-3.2 (three robots, a person and a game, with simulated
+            people), table-3.3 (on cable routing from images), table-8.3 (a fleet step over the network), gates (all of
+            them with 100 robots and 10 humans), figure-5.3 (Fleet-DAgger's comparison, with table C.2),
+            figure-5.5-remote (block pushing with scripted operators at consoles), figure-C.1 (the ablations of C.U.R.).
         tasks: which tasks; default: those of the figure.
-        seeds: root seeds; default: 0 to 4 for figure-2.3, table-3.1 and gates (table-3.3: with --full), 0 for figure-A.1,
-            else 0 to 2.
+        seeds: root seeds; default: 0 to 4 for figure-2.3, table-3.1 and gates (table-3.3: with --full), 0 to 9 for
+            table-3.2, 0 for figure-A.1, else 0 to 2.
         full: the published scale; default: one that takes less than an hour on 4 cores.
         workers: runs side by side, one core each.
         out: folder of the run folders.
@@ -329,7 +341,7 @@ def main(args: Sequence[str] | None = None) -> None:
     try:
         # These do without the learning libraries, or load them when they run.
         light = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
-        light |= {"serve": serve, "accounts": accounts, "audit": audit, "robot": robot, "fleet": remote}
+        light |= {"serve": serve, "accounts": accounts, "audit": audit, "study": study, "robot": robot, "fleet": remote}
         verbs = light if arguments[:1] and arguments[0] in light else _learning_verbs() | light
         _parse(verbs, arguments)()
         sys.stdout.flush()

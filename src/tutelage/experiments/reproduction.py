@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tutelage.errors import ConfigError
-from tutelage.experiments import figure_2_3, figure_a_1, gates_table, table_3, table_3_2
+from tutelage.experiments import figure_2_3, figure_5_5, figure_a_1, gates_table, table_3, table_3_2, table_8_3
 from tutelage.experiments.study import StudyConfig, run_study
 from tutelage.experiments.tables import tables
 
@@ -17,8 +17,8 @@ def reproduce(
     """Run what is missing of a figure; returns the tables, published and ours, as Markdown.
 
     Args:
-        what: "figure-2.3", "figure-A.1", "table-3.1", "table-3.2", "table-3.3", "gates", "figure-5.3" or
-            "figure-C.1".
+        what: "figure-2.3", "figure-A.1", "table-3.1", "table-3.2", "table-3.3", "table-8.3", "gates", "figure-5.3",
+            "figure-5.5-remote" or "figure-C.1".
         tasks: which tasks; empty: those of the figure.
         seeds: root seeds; empty: the figure's own number of them.
         full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000, figure-C.1 3,000; `gates`, which
@@ -43,9 +43,13 @@ def reproduce(
         each = given.pop("tasks", (gates_table.GatesConfig.task,))
         steps = 10_000 if full else gates_table.GatesConfig.steps
         return "\n".join(gates_table.reproduce(gates_table.GatesConfig(task, steps=steps, **given)) for task in each)
+    if what in ("table-3.2", "table-8.3", "figure-5.5-remote") and tasks:
+        raise ConfigError(f"{what} is about one task; leave out --tasks")
+    if what == "table-8.3":
+        return table_8_3.reproduce(table_8_3.Table83Config(results=given["results"]))
+    if what == "figure-5.5-remote":
+        return figure_5_5.reproduce(figure_5_5.Figure55Config(seeds or (0, 1, 2), results=given["results"]))
     if what == "table-3.2":
-        if tasks:
-            raise ConfigError("table-3.2 is about peg insertion; leave out --tasks")
         seeds = given.get("seeds", table_3_2.Table32Config.seeds)
         return table_3_2.reproduce(table_3_2.Table32Config(seeds, workers, results=given["results"]))
     if what in table_3.SETTINGS:

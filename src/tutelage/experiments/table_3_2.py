@@ -143,11 +143,13 @@ def _summary(result: dict[str, Any]) -> str:
     return f"{c['throughput']} tasks, {c['interventions']} interventions, {c['human_actions']} human actions"
 
 
-def table(results: list[dict[str, Any]]) -> str:
-    """Published and ours side by side, as Markdown."""
+def table(results: list[dict[str, Any]], who: str = "simulated participants") -> str:
+    """Published and ours side by side, as Markdown; of participants who lack a condition, nothing."""
+    conditions = {seed: {r["algorithm"] for r in results if r["seed"] == seed} for seed in {r["seed"] for r in results}}
+    results = [r for r in results if conditions[r["seed"]] >= set(PUBLISHED)]
     people = len({r["seed"] for r in results})
     lines = [
-        f"Table 3.2, {people} simulated participants with 3 robots, {STEPS} timesteps a condition. Mean ± standard "
+        f"Table 3.2, {people} {who} with 3 robots, {STEPS} timesteps a condition. Mean ± standard "
         "deviation over participants.",
         "",
         f"| Algorithm | | {' | '.join(COLUMNS.values())} |",
@@ -161,6 +163,9 @@ def table(results: list[dict[str, Any]]) -> str:
     for other in (HG, SAFE, LAZY):
         cells = []
         for name in COLUMNS:
+            if not found[other]:
+                cells.append("–")  # noqa: RUF001
+                continue
             pairs = [(a["counts"][name], b["counts"][name]) for a, b in zip(found[THRIFTY], found[other], strict=True)]
             cells.append("–" if pairs[0][1] is None else f"{_difference(pairs):+.1f} (p = {_p(pairs):.3f})")  # noqa: RUF001
         lines.append(f"| {other} | {' | '.join(cells)} |")
