@@ -39,8 +39,11 @@ class Running:
             self.accounts.add(role.name.lower(), role, PASSWORD)
         self.accounts.add("ana", Role.OPERATOR, PASSWORD)
         self.supervision = open_supervision(self.audit)
-        self.supervision.start()
-        self.context = Context(self.supervision, self.accounts, self.audit, Site(), static)
+        study = None if hasattr(self.supervision, "start") else self.supervision
+        if study is None:
+            self.supervision.start()
+        now = study.supervision if study else self.supervision
+        self.context = Context(now, self.accounts, self.audit, Site(), static, study)
         self.server = uvicorn.Server(uvicorn_config(create_app(self.context), "127.0.0.1", 0))
         self._thread = threading.Thread(target=self.server.run, daemon=True)
         self._thread.start()
@@ -112,7 +115,9 @@ class Socket:
         deadline = time.monotonic() + timeout
         while True:
             left = deadline - time.monotonic()
-            assert left > 0, f"no {types} {fields} came, but {[m for m in self.seen if m['type'] not in ('hello', 'state', 'metrics')]}"
+            assert left > 0, (
+                f"no {types} {fields} came, but {[m for m in self.seen if m['type'] not in ('hello', 'state', 'metrics')]}"
+            )
             try:
                 message = json.loads(self.connection.recv(left))
             except TimeoutError:

@@ -49,6 +49,11 @@ def create_app(context: Context) -> App:
     app.include_router(account_api.router)
     app.include_router(fleet_api.router)
 
+    if context.study:
+        from tutelage.console import study_api
+
+        app.include_router(study_api.router)
+
     async def run(socket: Socket) -> None:
         sockets.add(socket)
         try:

@@ -18,6 +18,7 @@ from tutelage.console.limits import is_loopback
 from tutelage.console.security import COOKIE, Site
 
 if TYPE_CHECKING:
+    from tutelage.console.study import Study
     from tutelage.console.supervision import Supervision
 
 log = logging.getLogger("tutelage.console")
@@ -57,6 +58,7 @@ class Context:
         audit: the record.
         site: where it is.
         static: folder of the built page.
+        study: the session of a user study, whose robots change from part to part; None: there is no study.
         logins: threads that hash passwords.
         control: those that carry out what people ask.
         slow: those that read the record and episodes.
@@ -67,6 +69,7 @@ class Context:
     audit: Audit
     site: Site = field(default_factory=Site)
     static: Path = STATIC
+    study: Study | None = None
     logins: Pool = field(default_factory=lambda: Pool("login", 2, 16))
     control: Pool = field(default_factory=lambda: Pool("control", 4, 256))
     slow: Pool = field(default_factory=lambda: Pool("slow", 2, 32))

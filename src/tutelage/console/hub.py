@@ -6,12 +6,15 @@ import asyncio
 import contextlib
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from tutelage.console.context import Context, log
 from tutelage.console.plain import plain, text
 from tutelage.console.states import Denied, LeaseEnded, LeaseGranted, Metrics, Notice, Offer, Snapshot, Stepped, Told
 from tutelage.errors import TutelageError
+
+if TYPE_CHECKING:
+    from tutelage.console.supervision import Supervision
 
 STATE_EVERY = 0.09
 """Seconds between two states: a little less than a tenth, so that a loop at 10 Hz is seen whole."""
@@ -31,6 +34,9 @@ class Listener(Protocol):
 
     def show(self, state: str) -> None:
         """A state: only the newest counts."""
+
+    def end(self, code: int, why: str) -> None:
+        """Close it."""
 
 
 def message_of(event: Told) -> dict[str, Any] | None:
@@ -62,6 +68,7 @@ class Hub:
         self._listeners: set[Listener] = set()
         self._names: Counter[str] = Counter()
         self._newest: Snapshot | None = None
+        self._study: str | None = None
         self._stepped = asyncio.Event()
         self._locks: dict[str, asyncio.Lock] = {}
         self._task: asyncio.Task[None] | None = None
@@ -78,13 +85,7 @@ class Hub:
 
     def start(self) -> None:
         """Listen to the supervision."""
-        loop = asyncio.get_running_loop()
-
-        def told(event: Told) -> None:
-            with contextlib.suppress(RuntimeError):  # the event loop ended
-                loop.call_soon_threadsafe(self._told, event)
-
-        self._unsubscribe = self.context.supervision.subscribe(told)
+        self._listen(asyncio.get_running_loop())
         self._task = asyncio.create_task(self._show_states())
 
     async def stop(self) -> None:
@@ -94,6 +95,24 @@ class Hub:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._task
+
+    def _listen(self, loop: asyncio.AbstractEventLoop) -> None:
+        def later(call: Callable[..., None], *args: Any) -> None:
+            with contextlib.suppress(RuntimeError):  # the event loop ended
+                loop.call_soon_threadsafe(call, *args)
+
+        self._unsubscribe = self.context.supervision.subscribe(lambda event: later(self._told, event))
+        if self.context.study:
+            self.context.study.changed = lambda: later(self._stepped.set)
+
+    def switch(self, supervision: Supervision) -> None:
+        """From now on people work with another supervision: their sockets end, and come back to it."""
+        self._unsubscribe()
+        self.context.supervision, self._newest = supervision, None
+        self.seats.clear()
+        self._listen(asyncio.get_running_loop())
+        for listener in list(self._listeners):
+            listener.end(1012, "the next part begins; come back")
 
     async def join(self, listener: Listener) -> str | None:
         """A socket opens; who may help takes a seat. Returns why they have none, or None."""
@@ -153,6 +172,12 @@ class Hub:
                 state = state_message(self._newest)
                 for listener in self._listeners:
                     listener.show(state)
+            if self.context.study:
+                study = text({"type": "study"} | self.context.study.state())
+                if study != self._study:
+                    self._study = study
+                    for listener in self._listeners:
+                        listener.tell(study)
             await asyncio.sleep(STATE_EVERY)
 
 

@@ -75,6 +75,7 @@ class LiveSocket(Socket):
         rows = await self.context.slow.run(supervision.metrics, max(0, newest.t - 10**9))
         me = {"name": self.name, "role": self.session.role.name.lower(), "seat": self.hub.seats.get(self.name)}
         hello = {"type": "hello", "me": me, "fleet": describe(self.websocket.app), "metrics": plain(rows[-HISTORY:])}
+        hello["study"] = self.context.study.state() if self.context.study else None
         standing = [text(message_of(event)) for event in supervision.standing(self.name)]
         # What was told while it joined comes after hello, and may be among what stands.
         self._events = deque([text(hello | {"server_time": time.time()}), *standing, *self._events])

@@ -32,6 +32,7 @@ from tutelage.console.messages import LONGEST
 from tutelage.console.security import App, Site
 
 if TYPE_CHECKING:
+    from tutelage.console.study import Study
     from tutelage.console.supervision import Supervision
 
 Say = Callable[[str], None]
@@ -125,11 +126,12 @@ class Server(uvicorn.Server):
                 signal.signal(number, handler)
 
 
-def serve(open_supervision: Callable[[Audit], Supervision], out: Path, web: WebConfig, say: Say) -> None:
+def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, web: WebConfig, say: Say) -> None:
     """Serve until Ctrl-C or SIGTERM.
 
     Args:
-        open_supervision: makes the fleet and its loop, which take their time; it has not begun.
+        open_supervision: makes the fleet and its loop, which take their time and have not begun; or a session of a study,
+            whose participant begins it.
         out: folder of the accounts and the record.
         web: where.
         say: takes lines for the person at the terminal.
@@ -147,11 +149,14 @@ def serve(open_supervision: Callable[[Audit], Supervision], out: Path, web: WebC
             raise ConfigError(f"make an account first: tutelage accounts add NAME --role admin --out {out}")
         listening = stack.enter_context(_listen(web.host, web.port))
         audit = stack.enter_context(contextlib.closing(Audit(out)))
-        supervision = stack.enter_context(contextlib.closing(open_supervision(audit)))
-        app = create_app(Context(supervision, accounts, audit, site))
+        opened = stack.enter_context(contextlib.closing(open_supervision(audit)))
+        study = None if hasattr(opened, "start") else opened
+        supervision = opened.supervision if hasattr(opened, "supervision") else opened
+        app = create_app(Context(supervision, accounts, audit, site, study=study))
         files = {"ssl_certfile": web.certificate, "ssl_keyfile": web.key} if site.tls else {}
         server = Server(uvicorn_config(app, web.host, web.port, **files))
-        supervision.start()
+        if not study:
+            supervision.start()
         audit.write("server", "server", action="start", pid=os.getpid())
         _greet(say, site, listening, invitation)
         server.run(sockets=[listening])
