@@ -26,14 +26,13 @@ from tutelage.console.herald import Herald
 from tutelage.console.offers import Offers
 from tutelage.console.operators import Operators
 from tutelage.console.parts import EngineConfig, Parts, Report, make_parts
-from tutelage.console.people import Desk, People, Reasons
+from tutelage.console.people import Desk, People, Reasons, ended_by
 from tutelage.console.states import LeaseEnded, LeaseGranted, Metrics, Notice, Snapshot, Stepped
 from tutelage.console.trainer import ProcessLearner
 from tutelage.errors import RunFolderError, TutelageError
 from tutelage.experiments.config import FORMAT
 from tutelage.experiments.recording import Recorder, lock
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.modes import Event
 from tutelage.fleet.policy import Learner
 from tutelage.fleet.priority import parse
 from tutelage.fleet.step import Step
@@ -41,15 +40,10 @@ from tutelage.store import load_tree, save_tree, write_atomic
 
 _LOG = logging.getLogger(__name__)
 FOREVER = 10**12
+SHOW = 0.5
+"""Seconds after which people see how things are while no timestep comes."""
 SWITCH = 0.0005
 """Seconds after which a thread that computes lets another one go on: the loop is to be on time while pictures are made."""
-ENDED_BY = {
-    Event.VIOLATE: "violated",
-    Event.SUCCESS: "completed",
-    Event.TIMEOUT: "completed",
-    Event.HARD_RESET: "reset_done",
-}
-"""What ends a lease at the end of a timestep, and why."""
 
 
 class Engine:
@@ -133,10 +127,12 @@ class Engine:
         fleet, run = parts.fleet, parts.config
         n = fleet.num_envs
         self.offers = Offers(n, run.humans, config.terms, self._log, self.wall)
-        self.driver = Driver(controls_of(config.task, fleet, parts.expert is not None), fleet, parts.expert)
+        self.driver = Driver(
+            controls_of(config.task, fleet, config.assist and parts.expert is not None), fleet, parts.expert
+        )
         self.people = People(self.offers, self.driver, self.lock, self.clock, config.lockstep, self.operators.used)
         self.reasons = Reasons(parse(run.priority, run.thresholds, run.gate), self.offers, run.queue == "fifo")
-        self.desk = Desk(self.people, self.reasons, self.clock, run.t_reset)
+        self.desk = Desk(self.people, self.reasons, self.clock, run.t_reset, config.gated)
         self.learner = self._learner(parts)
         self.loop = parts.assembly.loop(
             fleet=fleet, priority=self.reasons, team=self.people, allocator=self.desk, learner=self.learner, execution=None,
@@ -237,9 +233,10 @@ class Engine:
         """A moment of the clock as seconds since 1970."""
         return time.time() - (self.clock() - moment)
 
-    def publish(self) -> None:
-        """Tell what happened to offers and leases. Call it with the lock, and not in the middle of a timestep."""
-        for event in self.offers.take_events():
+    def publish(self) -> bool:
+        """Tell what happened to offers and leases, if anything did. Call it with the lock, and not amid a timestep."""
+        events = self.offers.take_events()
+        for event in events:
             if isinstance(event, LeaseGranted):
                 operator = self.operators[event.lease.operator]
                 operator.interventions += 1
@@ -250,6 +247,12 @@ class Engine:
             elif isinstance(event, LeaseEnded) and event.operator is not None:
                 self.operators[event.operator].human_time += event.seconds
             self.herald.tell(event)
+        return bool(events)
+
+    def show(self) -> None:
+        """Tell what it looks like now. Call it as `publish`."""
+        self.snapshot = self.recording.look(self.loop)
+        self.herald.tell(Stepped(None, self.snapshot))
 
     # -- what must not be forgotten -----------------------------------------------------------------------------
 
@@ -320,9 +323,7 @@ class Recording:
             engine.people.violation = loop.violation
             self._ends(step, now)
             engine.publish()
-            snapshot = self.look(loop)
-        engine.snapshot = snapshot
-        engine.herald.tell(Stepped(None, snapshot))
+            engine.show()
         self._metrics(loop, now)
         if now - self._saved_at >= engine.config.save_every and (self._saving is None or self._saving.done()):
             self.save(loop)
@@ -385,13 +386,11 @@ class Recording:
 
     def _ends(self, step: Step, now: float) -> None:
         offers = self._engine.offers
-        for event, robot in zip(step.events.event.tolist(), step.events.robot.tolist(), strict=True):
-            why = ENDED_BY.get(Event(event))
-            if why is None or robot not in offers.holds:
-                continue
-            if why == "reset_done":
+        for robot, why in ended_by(step.events):
+            if why == "reset_done" and robot in offers.holds:
                 self._engine.operators[offers.holds[robot].lease.operator].resets += 1
-            offers.end(robot, why, now)
+            if robot in offers.holds or why == "reset_done":
+                offers.end(robot, why, now)
 
     def _metrics(self, loop: Loop, now: float) -> None:
         engine = self._engine
@@ -486,16 +485,20 @@ class Pace:
         with engine.lock:
             while not engine.closing and (left := due - engine.clock()) > 0:
                 engine.lock.wait(left)
-                engine.publish()
+                if engine.publish():
+                    engine.show()
 
     def _wait_for_people(self) -> None:
         engine = self._engine
-        deadline = engine.clock() + engine.config.deadline
+        shown = engine.clock()
+        deadline = shown + engine.config.deadline
         with engine.lock:
             while not engine.closing and engine.clock() < deadline and engine.people.waiting_for():
                 engine.lock.wait(0.1)
                 engine.offers.tick(engine.clock())
-                engine.publish()
+                if engine.publish() or engine.clock() - shown > SHOW:
+                    engine.show()
+                    shown = engine.clock()
 
     def _hold(self, reason: str) -> None:
         """Nobody moves while nothing can be written down."""
@@ -507,8 +510,7 @@ class Pace:
                 engine.lock.wait(0.25)
                 engine.offers.tick(engine.clock())
                 engine.publish()
-                engine.snapshot = engine.recording.look(engine.loop)
-            engine.herald.tell(Stepped(None, engine.snapshot))
+                engine.show()
             if engine.audit.error is None and self._writable():
                 break
         engine.trouble, engine.people.frozen = None, False

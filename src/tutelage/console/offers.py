@@ -261,8 +261,9 @@ class Offers:
         self.stopped -= set(robots)
 
     def end(self, robot: int, why: str, now: float) -> None:
-        """Whatever there is about a robot ends: its lease, an offer, its hard reset."""
-        self.resetting.pop(robot, None)
+        """Whatever there is about a robot ends: its lease, an offer. A hard reset goes on until the loop says it is done."""
+        if why == "reset_done":
+            self.resetting.pop(robot, None)
         self.offers.pop(robot, None)
         self.left_behind.pop(robot, None)
         if robot in self.holds:

@@ -60,6 +60,8 @@ class EngineConfig:
         run: more settings of the run, by name, such as offline_pairs or learner.
         save_every: seconds between checkpoints.
         replay: whether interventions are kept as films.
+        gated: the algorithm also decides when an intervention ends, as the gates of chapters 2 and 3 do; else people do.
+        assist: whether people may let the algorithmic human act for them.
     """
 
     fleet: str = "sim:Navigation"
@@ -82,6 +84,8 @@ class EngineConfig:
     run: dict[str, Any] = field(default_factory=dict)
     save_every: float = 10.0
     replay: bool = True
+    gated: bool = False
+    assist: bool = True
 
     def __post_init__(self) -> None:
         kind, _, name = self.fleet.partition(":")

@@ -18,7 +18,8 @@ from tutelage.console.controls import Driver
 from tutelage.console.offers import NOBODY, Offers
 from tutelage.console.states import Denied, Lease
 from tutelage.fleet.allocation import FleetDAgger
-from tutelage.fleet.modes import Mode
+from tutelage.fleet.events import Events
+from tutelage.fleet.modes import Event, Mode
 from tutelage.fleet.priority import Constraint, Goal, Lexicographic, Priority, Random, Risk, Uncertainty, UncertaintyGoal
 from tutelage.fleet.supervisor import Team
 from tutelage.fleet.view import FleetView
@@ -276,6 +277,21 @@ def _reason_of(term: Any, view: FleetView, robot: int) -> str:
     return "novel" if thresholds is not None else "uncertain"
 
 
+ENDED_BY = {
+    Event.VIOLATE: "violated",
+    Event.SUCCESS: "completed",
+    Event.TIMEOUT: "completed",
+    Event.HARD_RESET: "reset_done",
+}
+"""What ends a lease at the end of a timestep, and why."""
+
+
+def ended_by(events: Events) -> list[tuple[int, str]]:
+    """The robots for which a timestep ends whatever lease there is, and why."""
+    found = events.of(*ENDED_BY)
+    return [(r, ENDED_BY[Event(e)]) for e, r in zip(found.event.tolist(), found.robot.tolist(), strict=True)]
+
+
 class Desk(FleetDAgger):
     """The allocator with people: who was offered a robot or has one is with it, in the loop's eyes.
 
@@ -284,11 +300,12 @@ class Desk(FleetDAgger):
         reasons: the priority of the same loop.
         clock: s, never goes back.
         t_reset: t_R, timesteps of a hard reset.
+        gated: whether the priority also decides when a robot needs its person no longer.
     """
 
-    def __init__(self, people: People, reasons: Reasons, clock: Clock, t_reset: int = 5) -> None:
+    def __init__(self, people: People, reasons: Reasons, clock: Clock, t_reset: int = 5, gated: bool = False) -> None:
         super().__init__(t_teleop=1, t_reset=t_reset)
-        self.people, self.reasons, self._clock = people, reasons, clock
+        self.people, self.reasons, self._clock, self._gated = people, reasons, clock, gated
 
     def __call__(self, ranks: Array, previous: Array, mode: Array, age: Array, rng: np.random.Generator) -> Array:
         """The robot of each person, (M,) int, or `NOBODY`."""
@@ -299,8 +316,10 @@ class Desk(FleetDAgger):
                 if robot in offers.holds or robot in offers.offers:
                     offers.end(robot, "stopped" if robot in offers.stopped else "offline", now)
             offers.resetting = {r: j for j, r in enumerate(previous.tolist()) if r != NOBODY and mode[r] == Mode.RESETTING}
-            for robot, hold in offers.holds.items():
+            for robot, hold in list(offers.holds.items()):
                 hold.resetting = robot in offers.resetting
+                if self._gated and mode[robot] == Mode.TELEOPERATED and not (ranks[robot] > 0).any():
+                    offers.end(robot, "ceded", now)
             offers.ask(self.reasons.order, self.reasons.reason, now)
             offers.tick(now)
             robots = np.array(offers.robot_of(), dtype=np.int64)

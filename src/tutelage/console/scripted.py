@@ -190,13 +190,15 @@ class ScriptedOperator:
                     tasks.append(asyncio.create_task(self._watch(video)))
                 while time.monotonic() < end and not until() and not any(task.done() for task in tasks):
                     await asyncio.sleep(0.02)
+                if self._accepting is not None:
+                    tasks.append(self._accepting)
+                for task in tasks:
+                    task.cancel()
+                for result in await asyncio.gather(*tasks, return_exceptions=True):
+                    if isinstance(result, Exception):
+                        raise result
                 if self._drive is not None:
                     await self._say(live, type="give_back", robot=self._drive.robot)
-                for task in tasks:
-                    if task.done() and not task.cancelled() and (error := task.exception()):
-                        raise error
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
         except (ConnectionClosed, OSError) as error:
             raise ConfigError(f"the console at {self.address} ended the connection: {error}") from None
         return self.tally

@@ -19,8 +19,9 @@ REASONS = ("", "violated", "uncertain", "risky", "novel", "asked")
 """Why a robot needs a person: it fell; its policy is unsure; the critic expects a fall; it has not seen such a state; the
 priority says so without saying why, or a person said so. Empty: it needs nobody."""
 
-ENDS = ("given_back", "expired", "handed_over", "reset_done", "offline", "stopped", "violated", "completed", "lost")
-"""Why a lease ended. completed: the episode ended; lost: the person went away and did not come back in time."""
+ENDS = ("given_back", "expired", "handed_over", "reset_done", "offline", "stopped", "violated", "completed", "lost", "ceded")
+"""Why a lease ended. completed: the episode ended; lost: the person went away and did not come back in time; ceded: the
+algorithm let the robot go on by itself."""
 
 
 class Denied(TutelageError):
