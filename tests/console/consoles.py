@@ -35,9 +35,14 @@ class Running:
         self.folder = folder
         self.audit = Audit(folder)
         self.accounts = Accounts(folder, Passwords(time_cost=1, memory_cost=1024))
-        for role in Role:
-            self.accounts.add(role.name.lower(), role, PASSWORD)
-        self.accounts.add("ana", Role.OPERATOR, PASSWORD)
+        if not self.accounts.all():
+            for name, role in {
+                "viewer": Role.VIEWER,
+                "operator": Role.OPERATOR,
+                "admin": Role.ADMIN,
+                "ana": Role.OPERATOR,
+            }.items():
+                self.accounts.add(name, role, PASSWORD)
         self.supervision = open_supervision(self.audit)
         study = None if hasattr(self.supervision, "start") else self.supervision
         if study is None:

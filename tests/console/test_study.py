@@ -25,6 +25,8 @@ from tutelage.experiments.user_study.protocol import CONDITIONS, HUMAN_GATED, QU
 from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
 
+pytestmark = pytest.mark.filterwarnings("ignore:at beta_H:UserWarning")
+
 SMALL = {
     "offline_pairs": 300, "calibration_steps": 60, "hidden": (16,), "members": 2,
     "learner": LearnerConfig(schedule="never", pretrain=30), "critic": CriticConfig(pretrain=20, hidden=(16,), batch=32),
@@ -148,7 +150,7 @@ def test_a_session_from_the_welcome_to_the_table(tmp_path: Path, sessions: list[
 def test_a_condition_that_was_interrupted_begins_anew_and_finished_ones_stay(
     tmp_path: Path, sessions: list[Session]
 ) -> None:
-    sessions.append(session := Session(tmp_path, practice=False, steps=10))
+    sessions.append(session := Session(tmp_path, practice=False, steps=10, hz=5.0))
     session.help_robots()
     session.next()
     session.next()
@@ -159,14 +161,14 @@ def test_a_condition_that_was_interrupted_begins_anew_and_finished_ones_stay(
     sessions.clear()
     first = tmp_path / "results" / f"{slug(order(4)[0])}-s4.json"
     kept = first.read_text()
-    sessions.append(again := Session(tmp_path, practice=False, steps=10))
+    sessions.append(again := Session(tmp_path, practice=False, steps=10, hz=5.0))
     state = again.next()
     assert (state["label"], state["state"], state["t"]) == ("B", "ready", 0)
     assert first.read_text() == kept
 
 
 def test_the_study_is_for_operators(tmp_path: Path, sessions: list[Session]) -> None:
-    sessions.append(session := Session(tmp_path, practice=False, steps=10))
+    sessions.append(session := Session(tmp_path, practice=False, steps=10, hz=5.0))
     assert httpx.get(f"{session.running.origin}/api/study").status_code == 401
     with contextlib.closing(session.running.client("viewer")) as viewer:
         assert viewer.get("/api/study").status_code == 403

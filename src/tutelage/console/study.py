@@ -108,8 +108,8 @@ def engine_of(config: StudyConfig, algorithm: str, seed: int, folder: Path) -> E
     rest["learner"] = run.learner
     return EngineConfig(
         fleet=f"sim:{run.task}", robots=ROBOTS, humans=1, priority="C." if human_gated else run.priority,
-        queue=run.queue, wait=run.wait, hz=config.hz, lockstep=True, deadline=60.0,
-        learner="none", t_reset=run.t_reset, seed=seed, out=folder, run=rest, replay=False,
+        queue=run.queue, wait=run.wait, gated=not human_gated, assist=config.assist, hz=config.hz, lockstep=True,
+        deadline=60.0, learner="none", t_reset=run.t_reset, seed=seed, out=folder, run=rest, replay=False,
     )  # fmt: skip
 
 
