@@ -9,7 +9,10 @@ from pathlib import Path
 
 from benchmarks.timing import machine
 
-NAMES = ("loop", "allocation", "engine", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies")
+NAMES = (
+    "loop", "allocation", "engine", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies",
+    "console",
+)  # fmt: skip
 
 
 def main() -> None:

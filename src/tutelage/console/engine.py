@@ -300,7 +300,7 @@ class Recording:
         self.losses: dict[str, float] = {}
         self._unwritten: list[tuple[str, int, dict[str, Any], dict[str, Any]]] = []
         self._metrics_at = self._saved_at = 0.0
-        self._slowest = self._latest = 0.0
+        self._slowest = self._latest = self._dearest = 0.0
         self._saver = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._saving: Future[None] | None = None
 
@@ -311,6 +311,7 @@ class Recording:
         """Write, end, tell."""
         engine = self._engine
         engine.tick = time.perf_counter() - engine.pace.began
+        self._dearest = max(self._dearest, time.thread_time() - engine.pace.worked)
         self._samples(step)
         try:
             engine.recorder.on_step(loop, step)
@@ -407,9 +408,10 @@ class Recording:
             "queue_wait": float(np.mean(self.waits)) if self.waits else 0.0,
             "policy_version": engine.policy_version,
             "tick_ms": 1000 * self._slowest,
+            "tick_cpu_ms": 1000 * self._dearest,
             "late_ms": 1000 * self._latest,
         }
-        self._metrics_at, self._slowest, self._latest = now, 0.0, 0.0
+        self._metrics_at, self._slowest, self._latest, self._dearest = now, 0.0, 0.0, 0.0
         engine.rows.append(row)
         engine.herald.tell(Metrics(None, row))
 
@@ -448,7 +450,8 @@ class Pace:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self.began = time.perf_counter()
+        self.began, self.worked = time.perf_counter(), 0.0
+        """When the timestep began, and the CPU time of the loop's thread then, s."""
         self._due = 0.0
 
     def on_start(self, loop: Loop) -> None:
@@ -478,7 +481,7 @@ class Pace:
         """Nothing to do."""
 
     def _ready(self) -> None:
-        self.began = time.perf_counter()
+        self.began, self.worked = time.perf_counter(), time.thread_time()
 
     def _wait_until(self, due: float) -> None:
         engine = self._engine
