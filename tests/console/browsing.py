@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -157,11 +158,25 @@ class Person:
         self.context.add_init_script(WATCH)
         self.page = self.context.new_page()
         self.page.set_default_timeout(15_000)
+        self.said: deque[str] = deque(maxlen=40)
+        self.page.on("websocket", self._listen)
         self.page.on("console", lambda m: m.type in ("error", "warning") and self.complaints.append(f"{m.type}: {m.text}"))
         self.page.on("pageerror", lambda error: self.complaints.append(f"exception: {error}"))
         self.page.goto(origin)
         if name is not None:
             self.sign_in(name)
+
+    def _listen(self, socket: Any) -> None:
+        """Keep what was said lately, for the report of a test that fails."""
+        began = time.monotonic()
+        often = re.compile(r'"type": ?"(state|ping|pong|got|watch|renew|command|link|metrics|hello)"')
+
+        def keep(way: str, message: object) -> None:
+            if isinstance(message, str) and not often.search(message):
+                self.said.append(f"{time.monotonic() - began:7.2f} {way} {message[:160]}")
+
+        socket.on("framesent", lambda message: keep("->", message))
+        socket.on("framereceived", lambda message: keep("<-", message))
 
     def sign_in(self, name: str, password: str = PASSWORD) -> None:
         self.page.get_by_label("Name").fill(name)
@@ -201,5 +216,8 @@ def person(browser: Any, origin: str, name: str | None, **options: Any) -> Itera
     try:
         yield somebody
         somebody.check()
+    except BaseException:
+        print(f"{name}: {somebody.page.url}", *somebody.said, somebody.page.locator("body").inner_text(), sep="\n")
+        raise
     finally:
         somebody.close()

@@ -128,7 +128,7 @@ def test_only_one_of_two_gets_a_robot_and_hands_it_over(browser: Any, served: Se
         first.page.locator(".hand-over summary").click()
         first.page.locator(".hand-over .popover").get_by_role("button", name=str(second.name)).click()
         first.see(".note", "Offered to")
-        second.see(".offer").get_by_role("button", name="Accept").click()
+        second.see(".offer", "robot 3").get_by_role("button", name="Accept").click()
         second.see(".stage-mine")
         first.page.wait_for_selector(".stage-mine", state="detached")
         first.see(".note", "handed over")
@@ -303,9 +303,10 @@ def test_every_page_shows_what_happened(browser: Any, served: Served) -> None:
         ada.see(".verdict-ok")
         ada.page.get_by_label("Kind").fill("login")
         ada.page.get_by_label("Kind").press("Enter")
-        ada.page.wait_for_function(
-            "[...document.querySelectorAll('.audit tbody tr')].every(r => r.cells[2].textContent === 'Login')"
+        kinds = (
+            "[...new Set([...document.querySelectorAll('.audit tbody tr')].map((row) => row.cells[2].textContent))].join()"
         )
+        until(lambda: ada.page.evaluate(kinds) == "Login", "only logins are listed")
 
         ada.go("/accounts")
         ada.page.get_by_label("Name", exact=True).fill("zoe")

@@ -75,9 +75,16 @@ function closed(code: number): void {
   const held = store.lease.value;
   batch(() => {
     store.forget();
-    if (held) store.note(`${store.robotName(held.robot)}: the connection was lost, the robot holds.`, "error");
+    if (held && code !== 1012) store.note(`${store.robotName(held.robot)}: the connection was lost, the robot holds.`, "error");
   });
   if (!wanted) return;
+  if (code === 1012) {
+    // The server goes on with other robots: it says so, and is there.
+    attempt = 0;
+    store.connection.value = { kind: "connecting" };
+    retryTimer = window.setTimeout(connect, 250);
+    return;
+  }
   if (code === 4401 || code === 1008 || code === 4403) void checkSession();
   scheduleRetry();
 }
@@ -158,6 +165,7 @@ function receive(message: ServerMessage): void {
         store.me.value = message.me;
         store.describe(message.fleet);
         store.addMetrics(message.metrics ?? [], true);
+        store.study.value = message.study ?? null;
         store.connection.value = { kind: "open" };
       });
       ping();
@@ -167,6 +175,7 @@ function receive(message: ServerMessage): void {
       break;
     case "state":
       store.applySnapshot(message);
+      withdraw();
       break;
     case "offer":
       offered(message.robot, message.reason, message.expires_in);
@@ -180,6 +189,15 @@ function receive(message: ServerMessage): void {
     case "lease_end":
       ended(message.robot, message.why);
       break;
+    case "study": {
+      const { type: _, ...state } = message;
+      if (state.calls && !store.study.value?.calls && state.interface === "game") {
+        chime("request");
+        spoken("A robot needs help.");
+      }
+      store.study.value = state;
+      break;
+    }
     case "metrics":
       store.addMetrics([message.row]);
       break;
@@ -217,6 +235,17 @@ function receive(message: ServerMessage): void {
   }
 }
 
+/** Offers that went to somebody else: the queue says who has them now. A robot that is handed over is not in the queue. */
+function withdraw(): void {
+  const state = store.snapshot.value;
+  const name = store.me.value?.name;
+  const at = Date.now() / 1000;
+  for (const [robot, offer] of store.offers.value) {
+    if (at - offer.since < 1 || state?.leases[String(robot)]) continue;
+    if (state?.queue.find((row) => row.robot === robot)?.offered_to !== name) forgetRobot(robot);
+  }
+}
+
 function forgetRobot(robot: number): void {
   if (store.offers.value.has(robot)) {
     const offers = new Map(store.offers.value);
@@ -234,9 +263,9 @@ function offered(robot: number, reason: Reason, expiresIn: number | null): void 
   const seconds = expiresIn ?? 15;
   const known = store.offers.value.has(robot);
   const offers = new Map(store.offers.value);
-  offers.set(robot, { reason, until: Date.now() / 1000 + seconds, seconds });
+  offers.set(robot, { reason, since: Date.now() / 1000, until: Date.now() / 1000 + seconds, seconds });
   store.offers.value = offers;
-  if (!known) {
+  if (!known && !store.study.value) {
     chime(reason === "violated" ? "urgent" : "request");
     spoken(`${store.robotName(robot)} asks for help: ${reasonText(reason)}.`);
   }

@@ -7,6 +7,7 @@ import "./styles/base.css";
 import "./styles/shell.css";
 import "./styles/operate.css";
 import "./styles/pages.css";
+import "./styles/study.css";
 import { get, whenSignedOut } from "./api";
 import { unlock } from "./chime";
 import { followLease } from "./drive";
@@ -18,6 +19,7 @@ import { Login } from "./pages/Login";
 import { More } from "./pages/More";
 import { Operate } from "./pages/Operate";
 import { Operators } from "./pages/Operators";
+import { Study } from "./pages/Study";
 import { Replay } from "./pages/Replay";
 import { Dialogs } from "./parts/Dialog";
 import { Notes } from "./parts/Notes";
@@ -53,6 +55,7 @@ function App() {
   const person = store.me.value;
   if (person === undefined) return <p class="nobody">One moment…</p>;
   if (person === null) return <Login setup={route.value.page === "setup" ? route.value.id : null} />;
+  if (store.study.value && store.canOperate.value) return <Study state={store.study.value} />;
   return (
     <Shell>
       <Page />
@@ -97,7 +100,7 @@ let drove: number | null = null;
 effect(() => {
   const robot = store.lease.value?.robot ?? null;
   untracked(() => {
-    if (robot === drove) return;
+    if (robot === drove || store.study.value) return;
     if (robot !== null) go(`/robot/${robot}`);
     else if (drove !== null && store.connection.value.kind === "open" && route.value.page === "robot" && route.value.id === String(drove)) {
       if (DONE.has(store.lastEnd.value)) go("/");

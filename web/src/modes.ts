@@ -61,6 +61,7 @@ const ENDINGS: Record<string, string> = {
   stopped: "It was stopped.",
   violated: "It violated its constraint; it needs a reset.",
   completed: "It completed its task.",
+  ceded: "The algorithm lets it go on.",
   lost: "The connection was lost.",
 };
 

@@ -96,8 +96,35 @@ export interface MetricsRow {
 
 export type Level = "info" | "warning" | "error";
 
+export interface Board {
+  cards: number;
+  /** Card -> picture. */
+  face_up: Record<string, number>;
+  pairs: number;
+  turns: number;
+}
+
+/** A participant's session of the user study (appendix B.4). Nothing of it names an algorithm. */
+export interface StudyState {
+  participant: number;
+  stage: "welcome" | "practice_game" | "practice_requests" | "practice_monitoring" | "condition" | "survey" | "done";
+  state: "ready" | "running" | "over";
+  label: string | null;
+  index: number | null;
+  of: number;
+  interface: "game" | "panes" | null;
+  t: number;
+  steps: number | null;
+  calls: boolean;
+  board: Board | null;
+  questions: Record<string, string>;
+  scale: [number, number] | number[];
+  labels: string[];
+}
+
 export type ServerMessage =
-  | { type: "hello"; me: Me; fleet: Description; metrics: MetricsRow[]; server_time: number }
+  | { type: "hello"; me: Me; fleet: Description; metrics: MetricsRow[]; server_time: number; study?: StudyState | null }
+  | ({ type: "study" } & StudyState)
   | ({ type: "state" } & Snapshot)
   | { type: "offer"; robot: number; reason: Reason; expires_in: number | null }
   | { type: "lease"; robot: number; id: string }

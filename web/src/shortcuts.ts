@@ -28,6 +28,8 @@ function letter(event: KeyboardEvent): void {
   if (event.repeat || event.ctrlKey || event.metaKey || event.altKey || isDriveKey(event.code)) return;
   if ((event.target as HTMLElement | null)?.closest?.("input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select, dialog")) return;
   const first = store.offers.value.keys().next().value;
+  // In the study, going to the robots accepts, and the algorithm gives them back.
+  if (store.study.value?.interface === "game" && event.code !== "KeyH") return;
   const driven = store.lease.value?.robot;
   if (event.code === "KeyA" && first !== undefined && driven === undefined) void takeOver(first);
   else if (event.code === "KeyD" && first !== undefined && driven === undefined) void decline(first);

@@ -3,7 +3,7 @@
 import { batch, computed, signal, type Signal } from "@preact/signals";
 import { ClockSync } from "./clocksync";
 import { lookOf, Mode, type Look } from "./modes";
-import type { Description, Level, Me, MetricsRow, QueueRow, Reason, Snapshot } from "./protocol";
+import type { Description, Level, Me, MetricsRow, QueueRow, Reason, Snapshot, StudyState } from "./protocol";
 
 /** undefined: not asked yet; null: nobody is signed in. */
 export const me = signal<Me | null | undefined>(undefined);
@@ -35,7 +35,7 @@ export const queue = signal<QueueRow[]>([]);
 export const metrics = signal<MetricsRow[]>([]);
 
 /** Requests that the server offers to this person: robot -> when the offer lapses (our clock, s). */
-export const offers = signal<ReadonlyMap<number, { reason: Reason; until: number; seconds: number }>>(new Map());
+export const offers = signal<ReadonlyMap<number, { reason: Reason; since: number; until: number; seconds: number }>>(new Map());
 /** The robot that this person drives, and the lease's id. */
 export const lease = signal<{ robot: number; id: string } | null>(null);
 /** Why the last one ended. */
@@ -43,6 +43,8 @@ export const lastEnd = signal("");
 /** Robots that this person asked for and does not have yet. */
 export const asked = signal<ReadonlySet<number>>(new Set());
 export const available = signal(true);
+/** The user study, where the server runs one; null: it runs a fleet. */
+export const study = signal<StudyState | null>(null);
 
 export const clockSync = new ClockSync();
 /** Updated twice a second, so that countdowns and ages move. Our clock, s. */

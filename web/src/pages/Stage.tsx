@@ -73,7 +73,7 @@ function Known({ index }: { index: number }) {
         </div>
         <aside class="panel" aria-label="Control">
           <Actions index={index} mine={mine} />
-          {mine && controls ? <Controls controls={controls} /> : null}
+          {mine && controls && robot.look !== "violated" && robot.look !== "resetting" ? <Controls controls={controls} /> : null}
         </aside>
       </div>
       <Strip except={index} />
@@ -81,7 +81,7 @@ function Known({ index }: { index: number }) {
   );
 }
 
-function View({ frame, index, camera, stats, mine }: { frame: { current: HTMLDivElement | null }; index: number; camera: number; stats: Signal<ViewStats>; mine: boolean }) {
+export function View({ frame, index, camera, stats, mine }: { frame: { current: HTMLDivElement | null }; index: number; camera: number; stats: Signal<ViewStats>; mine: boolean }) {
   const pointer = store.fleet.value?.controls.pointer;
   const usable = mine && !!pointer && pointer.camera === camera;
   const name = store.robotName(index);
@@ -245,8 +245,9 @@ function Actions({ index, mine }: { index: number; mine: boolean }) {
       <div class="actions">
         <p class="driving">
           <strong>{resetting ? "Resetting" : fallen ? "It needs a hard reset" : robot.held ? "It holds: press something" : "You drive"}</strong>
-          {since !== undefined ? <span class="num">{clock(store.now.value + store.clockSync.offset - since)}</span> : null}
+          {since !== undefined && !fallen ? <span class="num">{clock(store.now.value + store.clockSync.offset - since)}</span> : null}
         </p>
+        {fallen ? <p class="quiet">It violated its constraint and stands still. It can be driven when it has been reset.</p> : null}
         <div class="action-grid">
           <button type="button" class={`button ${fallen ? "" : "primary"}`} disabled={resetting} onClick={() => void giveBack(index)} aria-keyshortcuts="g">
             Give back <kbd>G</kbd>

@@ -95,7 +95,7 @@ function Tab({ page, text, path, badge = 0 }: { page: string; text: string; path
   );
 }
 
-function Link() {
+export function Link() {
   const kind = store.connection.value.kind;
   const late = store.stateAt.value !== null && store.now.value - store.stateAt.value > 1.5;
   const bad = kind !== "open" || late;
@@ -250,7 +250,7 @@ export function Shortcuts() {
   );
 }
 
-function Banner() {
+export function Banner() {
   const state = store.connection.value;
   if (state.kind === "lost") {
     const seconds = Math.max(0, Math.ceil(state.retryAt - store.now.value));
