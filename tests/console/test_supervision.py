@@ -142,6 +142,7 @@ class TestHelping:
             row = server.of.operators()[0]
             assert (row["operator"], row["interventions"], row["resets"]) == ("ann", 1, 1)
             assert row["acceptance_time"] > 0
+            assert row["human_time"] > 0
 
     def test_a_robot_that_has_not_fallen_may_be_reset_too(self, tmp_path: Path) -> None:
         with Serving(config(tmp_path)) as server:

@@ -41,9 +41,16 @@ class Operators:
         operator.commands += 1
         operator.latency.append(seconds)
 
-    def rows(self, present: set[str]) -> list[dict[str, Any]]:
-        """As JSON values. acceptance_time: mean; latency: from a command's arrival to its execution, ms, which includes the
-        wait for the next timestep."""
+    def rows(self, present: set[str], since: dict[str, float]) -> list[dict[str, Any]]:
+        """As JSON values.
+
+        acceptance_time: mean; latency: from a command's arrival to its execution, ms, which includes the wait for the next
+        timestep.
+
+        Args:
+            present: who is here.
+            since: for how long those who have a robot have had it, s.
+        """
         return [
             {
                 "operator": name,
@@ -52,7 +59,7 @@ class Operators:
                 "resets": o.resets,
                 "declined": o.declined,
                 "commands": o.commands,
-                "human_time": round(o.human_time, 3),
+                "human_time": round(o.human_time + since.get(name, 0.0), 3),
                 "acceptance_time": round(o.acceptance_time / o.accepted, 3) if o.accepted else None,
                 "latency_p50_ms": _percentile(o.latency, 50),
                 "latency_p99_ms": _percentile(o.latency, 99),

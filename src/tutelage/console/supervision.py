@@ -184,7 +184,9 @@ class Supervision:
         """What each person has done."""
         with self.engine.lock:
             present = {seat.operator for seat in self.engine.offers.seats if seat and seat.present}
-            return self.engine.operators.rows(present)
+            now = self.engine.clock()
+            since = {hold.lease.operator: now - hold.since for hold in self.engine.offers.holds.values()}
+            return self.engine.operators.rows(present, since)
 
     def episodes(self, limit: int = 100) -> list[dict[str, Any]]:
         """Recorded interventions, newest first: {id, robot, operator, began, seconds, outcome, frames}. Reads the disk."""
