@@ -41,12 +41,22 @@ def missing(what: str) -> None:
     pytest.skip(what)
 
 
-def start_chromium(playwright: Any) -> Any:
-    """The browser of this machine."""
+@contextlib.contextmanager
+def chromium() -> Iterator[Any]:
+    """The browser of this machine, without a window."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        missing("there is no playwright (pip install playwright)")
     path = next((found for name in CHROMIUM if (found := shutil.which(name))), None)
     if path is None:
         missing("there is no Chromium (apt-get install chromium)")
-    return playwright.chromium.launch(executable_path=path, args=list(SWITCHES), headless=True)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=list(SWITCHES), headless=True)
+        try:
+            yield browser
+        finally:
+            browser.close()
 
 
 class Served:
@@ -182,8 +192,7 @@ class Person:
         self.page.get_by_label("Name").fill(name)
         self.page.get_by_label("Password").fill(password)
         self.page.get_by_role("button", name="Sign in").click()
-        self.page.wait_for_selector(".tile")
-        self.page.wait_for_function("document.querySelector('.tally .num')?.textContent !== undefined")
+        self.page.wait_for_selector(".tile, .study")
 
     def go(self, path: str) -> None:
         """To another page of the console."""

@@ -9,24 +9,15 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browsing import PHONE, Person, Served, missing, person, start_chromium, until
-
-try:
-    from playwright.sync_api import sync_playwright
-except ImportError:
-    sync_playwright = None
+from browsing import PHONE, Person, Served, chromium, person, until
 
 ROBOTS = 4
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    if sync_playwright is None:
-        missing("there is no playwright (pip install playwright)")
-    with sync_playwright() as playwright:
-        found = start_chromium(playwright)
+    with chromium() as found:
         yield found
-        found.close()
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +171,7 @@ def test_escape_stops_one_robot_then_all_and_going_on_is_confirmed(browser: Any,
 def test_keys_alone_do_everything(browser: Any, served: Served) -> None:
     with person(browser, served.origin, None) as ana:
         keys = ana.page.keyboard
-        ana.page.wait_for_function("document.activeElement?.name === 'username'")
+        ana.page.wait_for_function("() => document.activeElement?.name === 'username'")
         keys.type("ana")
         keys.press("Tab")
         keys.type("correct horse battery")
