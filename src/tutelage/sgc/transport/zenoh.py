@@ -169,8 +169,12 @@ class ZenohTransport(Transport):
         self._closed.set()
         with self._lock:
             session, self._session = self._session, None
-            self._declarations.clear()
-            self._publishers.clear()
+            declarations, self._declarations = self._declarations, set()
+            self._publishers = {}
+        # Here, not by the session on threads of its own: they would need the interpreter, and a program that ends meanwhile
+        # would abort ("FATAL: exception not rethrown").
+        for declaration in declarations:
+            declaration.end()
         if session is not None:
             session.close()
         for tunnel in self._tunnels.values():
