@@ -158,6 +158,7 @@ def status(home: Positional[Path], seconds: float = 3.0) -> None:
         for row in fleet.status():
             age = "" if row["age"] is None else f"heard {row['age']:.2f} s ago, episode {row['episode']}, step {row['step']}"
             print(f"{row['name']:<24} {row['state']:<10} {age} {row['says']}".rstrip())
+    _leave(0)
 
 
 def _leave(status: int) -> None:
