@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tutelage.cli import main
+from tutelage.console.commands import accounts, audit, study
 from tutelage.envs.tasks import TASKS, MujocoTask
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.modes import INVALID, TABLE, Event, Mode
@@ -27,7 +28,7 @@ PAGES = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "results").glob("*.md")],
 )
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
-GROUPS = {"keys": keys, "proxy": proxy, "fleet": fleet}
+GROUPS = {"keys": keys, "proxy": proxy, "fleet": fleet, "accounts": accounts, "audit": audit, "study": study}
 GENERATED = {"runs", "site", "dist"}
 
 
@@ -139,7 +140,7 @@ def test_commands_and_their_options_exist(page: Path) -> None:
 def test_options_in_code_spans_exist(page: Path) -> None:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     own = {"--check", "--write", "--strict", "--seeds", "--ablations"}  # of tables, run_examples, mypy, study
-    verbs = ["run", "evaluate", "report", "reproduce", "train-expert", "check", "watch"]
+    verbs = ["run", "evaluate", "report", "reproduce", "train-expert", "check", "watch", "serve", "robot"]
     verbs += [f"{group} {verb}" for group, module in GROUPS.items() for verb in module.VERBS]
     known = "".join(filter(None, map(manual, verbs)))
     for option in set(re.findall(r"`(--[a-z][\w.-]*)", text)) - own:
