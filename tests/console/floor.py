@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from fakes import PointFleet
 
@@ -15,6 +16,7 @@ from tutelage.console.audit import Audit
 from tutelage.console.offers import Terms
 from tutelage.console.states import LeaseEnded, LeaseGranted, Notice, Offer, Snapshot, Stepped, Told
 from tutelage.console.supervision import EngineConfig, Supervision
+from tutelage.remote.jpeg import decode, encode
 
 QUICK = Terms(offer=5.0, declined=5.0, ignored=0.2, fresh=0.5, grace=1.0, idle=20.0)
 
@@ -32,6 +34,23 @@ def config(out: Path, **changes: Any) -> EngineConfig:
 def points(num_envs: int) -> PointFleet:
     """They fall off the table at -1 and beyond 1, and are done at 0.9. Ten timesteps at full speed."""
     return PointFleet(num_envs, bound=1.0, goal=0.9)
+
+
+def filmed(num_envs: int) -> PointFleet:
+    """Points with cameras of their own, which send JPEG: grey, brighter the farther to the right the robot is."""
+    fleet = points(num_envs)
+
+    def jpeg(robot: int, camera: int) -> tuple[float, bytes]:
+        del camera
+        grey = round(100 + 50 * float(fleet.obs[robot, 0]))
+        return time.time(), encode(np.full((18, 32, 3), grey, dtype=np.uint8))
+
+    def picture(robot: int, camera: int) -> tuple[float, Any]:
+        taken, content = jpeg(robot, camera)
+        return taken, decode(content)
+
+    fleet.jpeg, fleet.picture = jpeg, picture  # type: ignore[attr-defined]
+    return fleet
 
 
 class Serving:

@@ -16,6 +16,7 @@ from floor import LeaseEnded, Notice, Serving, Stepped, config
 
 from tutelage.console.audit import Audit, RecordError, samples_in, verify_folder
 from tutelage.console.states import Denied
+from tutelage.errors import TutelageError
 from tutelage.fleet.modes import Mode
 
 SERVER = """
@@ -70,6 +71,42 @@ class TestKilled:
             assert 0 < server.now.t <= known[-1]["t"] + 60
             server.steps(3)
             assert (server.now.mode == Mode.AUTONOMOUS).all()
+
+    def test_a_server_that_was_stopped_goes_on_where_it_was(self, tmp_path: Path) -> None:
+        with Serving(config(tmp_path)) as server:
+            lease = server.take("ann", 1)
+            for seq in range(4):
+                server.of.command("ann", 1, lease.id, seq, [0.1])
+                server.steps(1)
+            server.of.estop("ann", None)
+            server.steps(3)
+        last = server.of.engine.loop
+        with Serving(config(tmp_path, hz=0.5)) as again:
+            loop = again.of.engine.loop
+            assert last.t <= loop.t <= last.t + 1
+            assert (loop.obs == last.obs).all()
+            assert again.now.stopped.all()
+            assert again.of.engine.recorder.tally.summary()["teleoperation"] > 0
+            rows = {row["operator"]: row for row in again.of.operators()}
+            assert rows["ann"]["interventions"] == 1
+
+    def test_a_server_that_was_killed_before_its_first_timestep(self, tmp_path: Path) -> None:
+        with Serving(config(tmp_path)):
+            pass
+        (tmp_path / "checkpoint" / "serve.safetensors").unlink()
+        with Serving(config(tmp_path)) as server:
+            server.steps(2)
+
+    @pytest.mark.parametrize(
+        "name", ["serve.json", "config.json", "checkpoint/learner.safetensors", "checkpoint/serve.safetensors"]
+    )
+    def test_a_damaged_folder_is_one_clear_line(self, tmp_path: Path, name: str) -> None:
+        with Serving(config(tmp_path)):
+            pass
+        (tmp_path / name).write_bytes(b"{]")
+        with pytest.raises(TutelageError, match="damaged") as problem, Serving(config(tmp_path)):
+            pass
+        assert "\n" not in str(problem.value)
 
     def test_two_servers_do_not_share_a_folder(self, tmp_path: Path) -> None:
         from tutelage.errors import RunFolderError

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from floor import LeaseEnded, Serving
+from floor import LeaseEnded, Serving, config
 from test_frames import pushing
 
 
@@ -86,3 +86,25 @@ def test_no_films_where_nobody_wants_them(tmp_path: Path) -> None:
         assert server.of.episodes() == []
         assert server.of.episode(1) is None
         assert server.of.episode_frame(1, 0) is None
+
+
+def test_robots_with_cameras_are_filmed_as_they_sent_it(tmp_path: Path) -> None:
+    with Serving(config(tmp_path, fleet="sim:floor:filmed", hz=20.0)) as server:
+        assert server.of.jpeg(0, 0) is not None
+        assert server.of.jpeg(9, 0) is server.of.jpeg(0, 5) is None
+        frame = server.of.frame(2, 0, 320, 180)
+        assert frame is not None
+        assert frame.rgb.shape == (18, 32, 3)
+        lease = server.take("ann", 1)
+        for seq in range(20):
+            server.of.command("ann", 1, lease.id, seq, [0.3])
+            server.steps(1)
+        server.of.give_back("ann", 1)
+        server.wait(server.of.episodes, 5.0)
+        (row,) = server.of.episodes()
+        assert 4 <= row["frames"] <= 14, "a few a second"
+        first, last = (server.of.episode_frame(row["id"], k, 64, 36) for k in (0, row["frames"] - 1))
+        assert first is not None
+        assert last is not None
+        assert last.rgb.shape == (36, 64, 3)
+        assert last.rgb.mean() > first.rgb.mean() + 5, "it went to the right"

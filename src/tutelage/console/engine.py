@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -37,6 +37,9 @@ from tutelage.fleet.policy import Learner
 from tutelage.fleet.priority import parse
 from tutelage.fleet.step import Step
 from tutelage.store import load_tree, save_tree, write_atomic
+
+if TYPE_CHECKING:
+    from tutelage.remote.weights import SharedPolicy
 
 _LOG = logging.getLogger(__name__)
 FOREVER = 10**12
@@ -134,14 +137,15 @@ class Engine:
         self.reasons = Reasons(parse(run.priority, run.thresholds, run.gate), self.offers, run.queue == "fifo")
         self.desk = Desk(self.people, self.reasons, self.clock, run.t_reset, config.gated)
         self.learner = self._learner(parts)
+        self._shared = None if config.simulated else self._share()
         self.loop = parts.assembly.loop(
-            fleet=fleet, priority=self.reasons, team=self.people, allocator=self.desk, learner=self.learner, execution=None,
-            overlap=False,
+            fleet=fleet, policy=self._shared or parts.policy, priority=self.reasons, team=self.people, allocator=self.desk,
+            learner=self.learner, execution=None, overlap=False,
         )  # fmt: skip
         self.recorder = Recorder(config.out, n, run.humans, FOREVER, run.metrics_every, "none")
         self.pace = Pace(self)
         self.recording = Recording(self)
-        if parts.resumed:
+        if parts.resumed and self.checkpoint.exists():  # else it was killed before its first timestep
             self._resume()
         else:
             self.recording.save(self.loop, wait=True)
@@ -174,6 +178,19 @@ class Engine:
 
     def _swapped(self, version: int, seen: int) -> None:
         self._log_quietly("policy", "", None, version=version, seen=seen)
+        if self._shared is not None:
+            self.recording.later(self._shared.share)
+
+    def _share(self) -> SharedPolicy | None:
+        """Robots may have the policy themselves, where the policy of their network lets the server hand it out."""
+        from tutelage.remote.weights import SharedPolicy
+
+        inner: Any = self.parts.fleet.inner
+        try:
+            return SharedPolicy(inner, self.parts.policy)
+        except TutelageError as error:
+            _LOG.info("robots decide nothing by themselves: %s", error)
+            return None
 
     def _resume(self) -> None:
         path = self.checkpoint
@@ -440,6 +457,10 @@ class Recording:
         except TutelageError as error:
             self._engine.trouble = str(error)
 
+    def later(self, work: Callable[[], None]) -> None:
+        """Do something in the thread that waits for the disk."""
+        self._saver.submit(work)
+
     def close(self) -> None:
         """Wait for the disk."""
         self._saver.shutdown()
@@ -470,7 +491,9 @@ class Pace:
             self._hold(reason)
         if engine.config.lockstep:
             self._wait_for_people()
-        engine.late = max(0.0, engine.clock() - self._due) if not engine.parts.fleet.paces else 0.0
+        if engine.parts.fleet.paces:
+            self._due = engine.clock()
+        engine.late = max(engine.clock() - self._due, float(getattr(engine.parts.fleet.inner, "late", 0.0)))
         if engine.late > period:  # no hurrying after a stall: that would be a robot in fast motion
             self._due = engine.clock()
             if engine.config.lockstep:

@@ -121,6 +121,7 @@ class ScriptedOperator:
         self._fleet: dict[str, Any] = {}
         self._drive: _Drive | None = None
         self._accepting: asyncio.Task[None] | None = None
+        self._offered: dict[int, float] = {}
         self._seq = self._ref = 0
         self.tally = Tally()
         self.rows: list[dict[str, Any]] = []
@@ -213,7 +214,8 @@ class ScriptedOperator:
                 self._fleet = message["fleet"]
             elif kind == "offer":
                 self.tally.offers += 1
-                self._accepting = asyncio.create_task(self._accept(live, message["robot"]))
+                self._offered[message["robot"]] = time.monotonic() + (message.get("expires_in") or 0.0)
+                self._consider(live)
             elif kind == "lease":
                 self.tally.interventions += 1
                 self._drive = _Drive(message["robot"], message["id"])
@@ -222,6 +224,7 @@ class ScriptedOperator:
                 if self._drive is not None and self._drive.lease == message.get("id", self._drive.lease):
                     self.tally.resets += message["why"] == "reset_done"
                     self._drive = None
+                    self._consider(live)
             elif kind == "error":
                 self.tally.errors[message["code"]] = self.tally.errors.get(message["code"], 0) + 1
             elif kind == "pong":
@@ -231,12 +234,20 @@ class ScriptedOperator:
             elif kind == "link" and message["command_latency_ms"]["p99"] is not None:
                 self.tally.latency.append(message["command_latency_ms"]["p99"])
 
-    async def _accept(self, live: ClientConnection, robot: int) -> None:
+    def _consider(self, live: ClientConnection) -> None:
+        """Accept what is offered, soon; an offer may come before the news that the robot before it is gone."""
+        if self._accepting is None or self._accepting.done():
+            self._accepting = asyncio.create_task(self._accept(live))
+
+    async def _accept(self, live: ClientConnection) -> None:
         await asyncio.sleep(self._react)
-        if self._drive is None:
+        now = time.monotonic()
+        open_now = [robot for robot, expires in self._offered.items() if expires > now]
+        if self._drive is None and open_now:
+            self._offered = {}  # one at a time; whoever else asks will be offered again
             self.tally.accepted += 1
             with contextlib.suppress(ConnectionClosed):
-                await self._say(live, type="accept", robot=robot)
+                await self._say(live, type="accept", robot=open_now[-1])
 
     async def _work(self, live: ClientConnection) -> None:
         """Heartbeats, and commands at the fleet's rate."""
