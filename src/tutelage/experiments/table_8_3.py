@@ -55,8 +55,9 @@ def reproduce(config: Table83Config) -> str:
         TutelageError: the measurement failed, for instance as the extra sgc is missing.
     """
     results = [measure(config.robots, config.steps, size) for size in config.sizes]
-    config.results.mkdir(parents=True, exist_ok=True)
-    write_atomic(config.results / "steptime.json", (json.dumps(results, indent=1) + "\n").encode())
+    for result in results:
+        name = "x".join(str(n).rjust(4, "0") for n in result["image"][:2])
+        write_atomic(config.results / f"images-{name}.json", (json.dumps(result, indent=1) + "\n").encode())
     return table(results)
 
 

@@ -22,7 +22,7 @@ from tyro.conf import Positional
 
 from tutelage.envs.tasks import TASKS
 from tutelage.errors import RunFolderError, TutelageError
-from tutelage.experiments import figure_2_3, figure_a_1, gates_table, plots, table_3
+from tutelage.experiments import figure_2_3, figure_5_5, figure_a_1, gates_table, plots, table_3, table_3_2, table_8_3
 from tutelage.experiments.figures import figure, figure_name
 from tutelage.experiments.jobs import read_results
 from tutelage.experiments.levels import suits
@@ -47,6 +47,12 @@ SINGLE: dict[str, Callable[[list[dict[str, Any]]], str]] = {
     "gates": gates_table.table,
 }
 """What results/single/ holds and docs/results-single.md shows, and how."""
+PEOPLE: dict[str, Callable[[list[dict[str, Any]]], str]] = {
+    "table-3.2": table_3_2.table,
+    "figure-5.5-remote": figure_5_5.table,
+    "table-8.3": table_8_3.table,
+}
+"""Likewise docs/results-people.md."""
 
 
 # -- tables ---------------------------------------------------------------------------------------------------------------
@@ -257,11 +263,12 @@ class TablesConfig:
 
 def run(config: TablesConfig) -> list[Path]:
     """Rewrite the pages and draw the figures; returns the files that were, or with `check` should be, written."""
-    found = {name: read_results(config.results.parent / "single" / name) for name in SINGLE}
+    found = {name: read_results(config.results.parent / "single" / name) for name in (*SINGLE, *PEOPLE)}
     pages: dict[str, dict[str, str]] = {
         "results.md": {"tables": tables(config.results)},
         "tasks.md": {"levels": levels(config.results.parent / "levels.json")},
-        "results-single.md": {name: SINGLE[name](results) for name, results in found.items() if results},
+        "results-single.md": {name: make(found[name]) for name, make in SINGLE.items() if found[name]},
+        "results-people.md": {name: make(found[name]) for name, make in PEOPLE.items() if found[name]},
     }
     stale = []
     for file, parts in pages.items():
