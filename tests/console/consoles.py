@@ -48,7 +48,7 @@ class Running:
         if study is None:
             self.supervision.start()
         now = study.supervision if study else self.supervision
-        self.context = Context(now, self.accounts, self.audit, Site(), static, study)
+        self.context = Context(now, self.accounts, self.audit, Site(), static, study=study)
         self.server = uvicorn.Server(uvicorn_config(create_app(self.context), "127.0.0.1", 0))
         self._thread = threading.Thread(target=self.server.run, daemon=True)
         self._thread.start()

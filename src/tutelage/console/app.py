@@ -18,7 +18,7 @@ except ModuleNotFoundError:
 
 from tutelage.console import account_api, fleet_api, site
 from tutelage.console.audit import RecordError
-from tutelage.console.context import Context, log
+from tutelage.console.context import Context, has_webrtc, log
 from tutelage.console.hub import Hub
 from tutelage.console.live import LiveSocket
 from tutelage.console.messages import problem
@@ -40,6 +40,8 @@ def create_app(context: Context) -> App:
             yield
         finally:
             await video.stop()
+            if has_webrtc():
+                await app.state.peers.stop()
             await hub.stop()
             context.close()
 
@@ -49,6 +51,11 @@ def create_app(context: Context) -> App:
     app.include_router(account_api.router)
     app.include_router(fleet_api.router)
 
+    if has_webrtc():
+        from tutelage.console import webrtc
+
+        app.state.peers = webrtc.Peers(context, context.host)
+        app.include_router(webrtc.router)
     if context.study:
         from tutelage.console import study_api
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib.util
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -58,6 +59,7 @@ class Context:
         audit: the record.
         site: where it is.
         static: folder of the built page.
+        host: the address on which the server listens.
         study: the session of a user study, whose robots change from part to part; None: there is no study.
         logins: threads that hash passwords.
         control: those that carry out what people ask.
@@ -69,6 +71,7 @@ class Context:
     audit: Audit
     site: Site = field(default_factory=Site)
     static: Path = STATIC
+    host: str = "127.0.0.1"
     study: Study | None = None
     logins: Pool = field(default_factory=lambda: Pool("login", 2, 16))
     control: Pool = field(default_factory=lambda: Pool("control", 4, 256))
@@ -78,6 +81,11 @@ class Context:
         """End the threads."""
         for pool in (self.logins, self.control, self.slow):
             pool.close()
+
+
+def has_webrtc() -> bool:
+    """Whether the extra for pictures by WebRTC is installed."""
+    return importlib.util.find_spec("aiortc") is not None
 
 
 def context_of(request: Request) -> Context:

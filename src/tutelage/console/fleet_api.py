@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from tutelage import __version__
 from tutelage.console.accounts import Role, Session
 from tutelage.console.chain import Row
-from tutelage.console.context import at_least, context_of, local, session_of
+from tutelage.console.context import at_least, context_of, has_webrtc, local, session_of
 from tutelage.console.messages import Robot
 from tutelage.console.pictures import jpeg
 from tutelage.console.plain import parsed, plain
@@ -40,7 +40,7 @@ def fleet(request: Request, who: Anybody) -> dict[str, Any]:
 def describe(app: Any) -> dict[str, Any]:
     """The fleet's description, with the server's version and time."""
     said: dict[str, Any] = plain(app.state.context.supervision.description.to_json())
-    return said | {"version": __version__, "server_time": time.time()}
+    return said | {"version": __version__, "server_time": time.time(), "webrtc": has_webrtc()}
 
 
 @router.get("/api/metrics")
@@ -166,5 +166,7 @@ def prometheus(request: Request) -> str:
     numbers |= {f"tutelage_fleet_{name}": value for name, value in newest.items() if isinstance(value, int | float)}
     numbers |= {f"tutelage_console_{name}": value for name, value in app.state.hub.counts().items()}
     numbers |= {f"tutelage_video_{name}": value for name, value in app.state.video.counts().items()}
+    if has_webrtc():
+        numbers |= {f"tutelage_webrtc_{name}": value for name, value in app.state.peers.counts().items()}
     numbers["tutelage_record_error"] = int(c.audit.error is not None)
     return "".join(f"# TYPE {name} gauge\n{name} {float(value):g}\n" for name, value in numbers.items())

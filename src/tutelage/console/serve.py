@@ -152,7 +152,7 @@ def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, w
         opened = stack.enter_context(contextlib.closing(open_supervision(audit)))
         study = None if hasattr(opened, "start") else opened
         supervision = opened.supervision if hasattr(opened, "supervision") else opened
-        app = create_app(Context(supervision, accounts, audit, site, study=study))
+        app = create_app(Context(supervision, accounts, audit, site, host=web.host, study=study))
         files = {"ssl_certfile": web.certificate, "ssl_keyfile": web.key} if site.tls else {}
         server = Server(uvicorn_config(app, web.host, web.port, **files))
         if not study:
