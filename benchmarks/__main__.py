@@ -11,7 +11,7 @@ from benchmarks.timing import machine
 
 NAMES = (
     "loop", "allocation", "engine", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies",
-    "console",
+    "console", "fleet_step",
 )  # fmt: skip
 
 

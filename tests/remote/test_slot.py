@@ -95,3 +95,13 @@ def test_damage_is_counted(slot: Slot) -> None:
     assert not slot.look(b"JFIF", 0, 10.1)
     assert not slot.look(pack_picture(Picture(1, 1, 0, 4, 4, b"no picture")), 0, 10.1)
     assert slot.counts["malformed"] == 4
+
+
+def test_what_does_not_fit_is_forgotten_when_it_becomes_known_what_does(slot: Slot) -> None:
+    early = Slot("other")
+    assert early.observe(seen(1, size=3), None, SERVER, 10.0)
+    early.settle_on(FLEET)
+    assert early.newest is None
+    assert early.state(10.0, DEADLINE) == "misfit"
+    assert early.observe(seen(1, boot=2), FLEET, SERVER, 10.1)  # it was started again, as what it should be
+    assert not early.misfit

@@ -33,7 +33,7 @@ class Table83Config:
 
     Attributes:
         robots: N.
-        steps: of ours; of SSH a fifth of it.
+        steps: of ours; of SSH a fifteenth of it.
         sizes: of the images, height and width.
         results: folder of the small result file.
     """
@@ -63,7 +63,7 @@ def reproduce(config: Table83Config) -> str:
 
 def measure(robots: int, steps: int, size: tuple[int, int]) -> dict[str, Any]:
     """One size of images, in a process of its own: this package does not know the one that it measures."""
-    words = ["--robots", robots, "--steps", steps, "--ssh-steps", max(1, steps // 5), "--size", f"{size[0]}x{size[1]}"]
+    words = ["--robots", robots, "--steps", steps, "--ssh-steps", max(1, steps // 15), "--size", f"{size[0]}x{size[1]}"]
     command = [sys.executable, "-m", "tutelage.remote.steptime", *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:

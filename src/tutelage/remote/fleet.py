@@ -206,10 +206,10 @@ class RemoteFleet(Fleet):
         """Whether `step_wait` sleeps to the next tick."""
         return self.hz is not None
 
-    @property
-    def deadline(self) -> float:
-        """Seconds without an observation after which a robot is out of reach."""
-        return max(self._deadline, 3 * self._description.dt) if self._description is not None else self._deadline
+    def _reach(self, slot: Slot) -> float:
+        """Seconds without an observation after which this robot is out of reach."""
+        known = slot.description or self._description
+        return max(self._deadline, 3 * known.dt) if known is not None else self._deadline
 
     # -- the fleet ---------------------------------------------------------------------------------------------------------
 
@@ -316,7 +316,7 @@ class RemoteFleet(Fleet):
             self._send_stop(i, StopOperation.CLEAR)
 
     def picture(self, robot: int, camera: int = 0) -> tuple[float, NDArray[np.uint8]] | None:
-        """The newest picture of a robot's camera: when it came (seconds since 1970), and (H, W, 3) uint8.
+        """The newest picture of a robot's camera: when it came (seconds since 1970), and (H, W, 3) uint8; None without one.
 
         Robots send pictures only of cameras that somebody looks at: the first call for a while gives None.
         """
@@ -332,6 +332,8 @@ class RemoteFleet(Fleet):
     def jpeg(self, robot: int, camera: int = 0) -> tuple[float, bytes] | None:
         """As `picture`, compressed as it came."""
         slot = self._slots[robot]
+        if not 0 <= camera < len(self.cameras):
+            return None
         with self._news:
             slot.watch(camera, time.monotonic())
             found = slot.pictures.get(camera)
@@ -372,7 +374,7 @@ class RemoteFleet(Fleet):
                 rows.append(
                     {
                         "name": slot.name,
-                        "state": slot.state(now, self.deadline),
+                        "state": slot.state(now, self._reach(slot)),
                         "age": now - slot.heard_at if seen is not None else None,
                         "round_trip": None if np.isnan(slot.round_trip) else slot.round_trip,
                         "episode": seen.episode if seen is not None else 0,
@@ -423,7 +425,7 @@ class RemoteFleet(Fleet):
     # -- with the lock held -------------------------------------------------------------------------------------------------
 
     def _states(self, now: float) -> list[str]:
-        return [slot.state(now, self.deadline) for slot in self._slots]
+        return [slot.state(now, self._reach(slot)) for slot in self._slots]
 
     def _online(self, now: float) -> Mask:
         """Those that the loop was told are in reach, and still are."""
@@ -459,7 +461,7 @@ class RemoteFleet(Fleet):
     def _order(self, i: int, action: Array, moving: bool, now: float) -> bytes | None:
         slot = self._slots[i]
         seen = slot.delivered if moving else slot.newest
-        if seen is None or slot.newest is None or now - slot.heard_at > self.deadline:
+        if seen is None or slot.newest is None or now - slot.heard_at > self._reach(slot):
             return None
         period = 1.0 / self.hz if self.hz else 0.0
         order, what = (Order.ACT, action) if moving else (Order(0), action[:0])
@@ -474,7 +476,7 @@ class RemoteFleet(Fleet):
     def _wait(self) -> None:
         if self.hz is None:
             with self._news:
-                self._news.wait_for(self._all_answered, self.deadline)
+                self._news.wait_for(self._all_answered, self._deadline)
             return
         period, now = 1.0 / self.hz, time.monotonic()
         if self._tick < now - period:  # the first step, or the loop took longer than a tick: begin to count anew
@@ -517,7 +519,7 @@ class RemoteFleet(Fleet):
             due: list[tuple[int, StopOperation]] = []
             with self._news:
                 for i, slot in enumerate(self._slots):
-                    here = slot.newest is not None and now - slot.heard_at < self.deadline
+                    here = slot.newest is not None and now - slot.heard_at < self._reach(slot)
                     if now - slot.stop_at >= STOP_AGAIN and here:
                         if slot.stop and not slot.has(Flag.STOPPED):
                             due.append((i, StopOperation.STOP))
@@ -555,6 +557,8 @@ class RemoteFleet(Fleet):
                 return  # it has started again meanwhile, and is asked again
             if self._description is None:
                 self._description = said
+                for other in self._slots:
+                    other.settle_on(said)
                 write_atomic(self._file, (json.dumps(said.to_json(), indent=1) + "\n").encode())
             if said.matches(self._description):
                 slot.description = said

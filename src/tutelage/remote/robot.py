@@ -284,7 +284,7 @@ class Robot:
             due = began + self._dt * (EARLY if new else LATE if not self._held else 1.0)
             until = min(due, self.gate.until) if not self._held else due
             with self._news:
-                if self._asked is not None or self.latch.stopped != stopped:
+                if (self._asked is not None and not stopped) or self.latch.stopped != stopped:
                     return
                 again = self.gate.current(now)
                 if again is not command:
@@ -296,10 +296,13 @@ class Robot:
     def _turn(self) -> None:
         """One timestep: act or hold, look, tell."""
         try:
-            asked, self._asked = self._asked, None
+            asked = self._asked
             if asked is not None and not self.latch.stopped:
                 self._publish(self._flags() | Flag.RESETTING)
                 self._reset(asked.seed, hard=asked.operation == Operation.HARD_RESET)
+                with self._news:
+                    if self._asked is asked:  # else a newer one came meanwhile; one that failed is tried again
+                        self._asked = None
             self._act()
             self._look()
             self._failing_since = None

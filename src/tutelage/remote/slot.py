@@ -84,8 +84,7 @@ class Slot:
             seen = unpack_observation(data)
         except Malformed:
             return self._drop("malformed")
-        if fleet is not None and not _fits(seen, fleet):
-            self.misfit = f"observes {seen.obs.shape} {seen.obs.dtype}, and the fleet {fleet.shape} {fleet.dtype}"
+        if fleet is not None and not self._fits(seen, fleet):
             return self._drop("shape")
         before = self.newest
         if before is None or seen.boot != before.boot:
@@ -94,6 +93,7 @@ class Slot:
             if before is not None:
                 self._past.append(before.boot)
             self.starts += 1
+            self.reset, self.accepted = "", None  # a start is a reset
             self.description, self.misfit, self.ask_at = None, "", float("-inf")
             self.pictures.clear()
         elif seen.number <= before.number:
@@ -174,15 +174,22 @@ class Slot:
         """The cameras that somebody looks at, a bit each."""
         return sum(1 << camera for camera, when in self._watched.items() if now - when < WATCHING)
 
+    def settle_on(self, fleet: Description) -> None:
+        """It is known now what robots of this fleet are: what came before may not fit."""
+        if self.newest is not None and not self._fits(self.newest, fleet):
+            self._drop("shape")
+            self.newest = self.delivered = None
+
+    def _fits(self, seen: Observation, fleet: Description) -> bool:
+        obs, proposal = seen.obs, seen.proposal
+        if obs.shape != fleet.shape or obs.dtype != np.dtype(fleet.dtype):
+            self.misfit = f"observes {obs.shape} {obs.dtype}, and the fleet {fleet.shape} {fleet.dtype}"
+            return False
+        if proposal is not None and len(proposal) != len(fleet.action_low):
+            self.misfit = f"proposes {len(proposal)} numbers, and an action has {len(fleet.action_low)}"
+            return False
+        return True
+
     def _drop(self, reason: str) -> bool:
         self.counts.add(reason)
         return False
-
-
-def _fits(seen: Observation, fleet: Description) -> bool:
-    obs, proposal = seen.obs, seen.proposal
-    return (
-        obs.shape == fleet.shape
-        and obs.dtype == np.dtype(fleet.dtype)
-        and (proposal is None or len(proposal) == len(fleet.action_low))
-    )

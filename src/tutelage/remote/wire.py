@@ -382,8 +382,8 @@ def unpack_observation(data: bytes) -> Observation:
     )
     if not (boot and number and episode) or flags >= 2 * Flag.FAULT or arrays not in (1, 2):
         raise Malformed("an observation with a field out of range")
-    if not (math.isfinite(waited) and waited >= 0 and math.isfinite(total)):
-        raise Malformed("an observation with a number that is not finite")
+    if not (0 <= waited < 1e9 and abs(total) < 1e15):  # and no NaN
+        raise Malformed("an observation with an impossible time or return")
     obs, at = _read_array(body, _OBSERVATION.size)
     proposal = None
     if arrays == 2:
