@@ -33,7 +33,7 @@ def policies(field: Field) -> Iterator[Policies]:
         policy = EnsemblePolicy((2,), fleet.action_low, fleet.action_high, members=2, hidden=(8,), seed=3)
         shared = SharedPolicy(fleet, policy)
         still = np.zeros((1, 2), np.float32)
-        drive(lambda: fleet.step(still), lambda: fleet.proposals()[1][0] == 1)
+        drive(lambda: fleet.step(still), lambda: fleet.proposals()[1][0] == shared.version)
         yield fleet, shared, policy
     finally:
         fleet.close()
@@ -58,11 +58,12 @@ def test_new_weights_are_swapped_in_while_the_robot_works(policies: Policies) ->
     for member in policy.net.parameters():
         member.data.mul_(0.5)
     policy.forget()
+    before = shared.version
     shared.share()
-    assert shared.version == 2
+    assert shared.version == before + 1
     obs = fleet.step(np.zeros((1, 2), np.float32))[0]
     assert shared.act(obs) == pytest.approx(policy.act(obs), abs=1e-5)  # until they arrive, what the server would do
-    drive(lambda: fleet.step(shared.act(fleet._obs)), lambda: fleet.proposals()[1][0] == 2)
+    drive(lambda: fleet.step(shared.act(fleet._obs)), lambda: fleet.proposals()[1][0] == shared.version)
     obs = fleet.step(shared.act(fleet._obs))[0]
     assert fleet.proposals()[0] == pytest.approx(policy.act(obs), abs=1e-5)
 
@@ -75,3 +76,15 @@ def test_the_server_overrides(field: Field, policies: Policies) -> None:
     for _ in range(5):
         fleet.step(np.array([[0.125, -0.25]], np.float32))
     assert {note.words for note in field.notes(1, began, "act")} == {("0.125", "-0.25")}
+
+
+def test_weights_of_an_earlier_server_are_not_taken_for_those_of_the_next(policies: Policies) -> None:
+    fleet, shared, policy = policies
+    for member in policy.net.parameters():
+        member.data.mul_(0.25)
+    policy.forget()
+    again = SharedPolicy(fleet, policy)  # as a server does that starts anew
+    assert again.version != shared.version
+    obs = fleet.step(np.zeros((1, 2), np.float32))[0]
+    assert again.act(obs) == pytest.approx(policy.act(obs), abs=1e-5)
+    drive(lambda: fleet.step(again.act(fleet._obs)), lambda: fleet.proposals()[1][0] == again.version)

@@ -15,6 +15,7 @@ Weights travel as safetensors, whole, sealed, and only to who may ask for them; 
 from __future__ import annotations
 
 import logging
+import secrets
 import tempfile
 import threading
 import time
@@ -59,7 +60,7 @@ class SharedPolicy:
     """A policy of the server that its robots have, too. A policy for the loop, and a subscriber of it.
 
     Attributes:
-        version: of the weights that were handed out last.
+        version: of the weights that were handed out last; counts up from a random number.
     """
 
     def __init__(self, fleet: RemoteFleet, policy: Saved) -> None:
@@ -68,7 +69,7 @@ class SharedPolicy:
             NotAllowed: the fleet network's policy does not let the server hand out weights.
         """
         self.fleet, self.policy = fleet, policy
-        self.version = 0
+        self.version = secrets.randbits(31)  # no other start of the server has it: robots may still have that one's weights
         self._shared_at = float("-inf")
         self._changed = False
         self.share()
