@@ -377,6 +377,51 @@ def test_strange_lengths_are_refused(running: Running, length: str) -> None:
         assert raw.recv(65536).split()[1] in (b"400", b"413")
 
 
+@pytest.mark.parametrize("begun", [b"", b"GET / HT", b"POST /api/login HTTP/1.1\r\ncontent-length: 10\r\n\r\nab"])
+def test_half_a_request_does_not_hold_a_connection(running: Running, monkeypatch: pytest.MonkeyPatch, begun: bytes) -> None:
+    import socket
+
+    monkeypatch.setattr("tutelage.console.protocol.REQUEST_SECONDS", 0.3)
+    with socket.create_connection(("127.0.0.1", running.port), timeout=5) as raw:
+        raw.sendall(begun)
+        began = time.monotonic()
+        with contextlib.suppress(ConnectionResetError):
+            while raw.recv(65536):
+                pass
+        assert time.monotonic() - began < 3
+    with contextlib.closing(running.client()) as client:  # between requests a connection may wait
+        assert client.get("/healthz").status_code == 200
+        time.sleep(0.6)
+        assert client.get("/healthz").status_code == 200
+
+
+def test_one_place_has_a_limited_number_of_connections(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    import socket
+
+    from tutelage.console import protocol
+
+    monkeypatch.setattr(protocol, "EACH_MAX", sum(protocol._open.values()) + 5)
+    with running.socket("ana") as ana:  # a socket is no request
+        ana.hear("hello")
+        with contextlib.ExitStack() as stack:
+            raws = [stack.enter_context(socket.create_connection(("127.0.0.1", running.port), timeout=5)) for _ in range(20)]
+            refused = 0
+            for raw in raws:
+                raw.settimeout(0.3)
+                with contextlib.suppress(TimeoutError):
+                    try:
+                        refused += raw.recv(1) == b""
+                    except ConnectionResetError:
+                        refused += 1
+            assert 12 <= refused < 20
+        ana.say("ping", n=3)
+        ana.hear("pong", n=3)
+    deadline = time.monotonic() + 5
+    while sum(protocol._open.values()) > 3:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),

@@ -64,6 +64,7 @@ class Context:
         logins: threads that hash passwords.
         control: those that carry out what people ask.
         slow: those that read the record and episodes.
+        verifying: the one that waits for a verification of the record.
     """
 
     supervision: Supervision
@@ -76,10 +77,11 @@ class Context:
     logins: Pool = field(default_factory=lambda: Pool("login", 2, 16))
     control: Pool = field(default_factory=lambda: Pool("control", 4, 256))
     slow: Pool = field(default_factory=lambda: Pool("slow", 2, 32))
+    verifying: Pool = field(default_factory=lambda: Pool("verifying", 1, 4))
 
     def close(self) -> None:
         """End the threads."""
-        for pool in (self.logins, self.control, self.slow):
+        for pool in (self.logins, self.control, self.slow, self.verifying):
             pool.close()
 
 

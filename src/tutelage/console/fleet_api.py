@@ -16,6 +16,7 @@ from tutelage.console.context import at_least, context_of, has_webrtc, local, se
 from tutelage.console.messages import Robot
 from tutelage.console.pictures import jpeg
 from tutelage.console.plain import parsed, plain
+from tutelage.console.verifying import verify_apart
 
 router = APIRouter()
 Anybody = Annotated[Session, Depends(session_of)]
@@ -81,7 +82,7 @@ async def audit(
 async def verify(request: Request, who: Operator) -> dict[str, Any]:
     """Whether the record is whole."""
     c = context_of(request)
-    verdict = await c.slow.run(c.audit.verify)
+    verdict = await c.verifying.run(verify_apart, c.audit.path.parent)
     return {"ok": verdict.ok, "rows": verdict.rows, "broken_at": verdict.broken_at, "why": verdict.why, "head": verdict.head}
 
 

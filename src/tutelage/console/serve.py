@@ -29,6 +29,7 @@ from tutelage.console.audit import Audit
 from tutelage.console.context import Context
 from tutelage.console.limits import is_loopback
 from tutelage.console.messages import LONGEST
+from tutelage.console.protocol import PatientProtocol
 from tutelage.console.security import App, Site
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def uvicorn_config(app: App, host: str, port: int, **options: Any) -> uvicorn.Co
         app,
         host=host,
         port=port,
+        http=PatientProtocol,
         ws_max_size=LONGEST,
         ws_ping_interval=2.0,
         ws_ping_timeout=3.0,
