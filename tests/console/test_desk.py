@@ -48,6 +48,16 @@ class Floor(RuleBasedStateMachine):
         self.granted: set[str] = set()
         self.ended: set[str] = set()
         self.seq = 0
+        self.meanwhile: list[tuple[str, tuple[Any, ...]]] = []
+        start = self.points.step_async
+
+        def step_async(actions: Any, active: Any = None) -> None:
+            start(actions, active)
+            for what, arguments in self.meanwhile:
+                self.ask_for(what, *arguments)
+            self.meanwhile = []
+
+        self.points.step_async = step_async  # type: ignore[method-assign]
 
     def clock(self) -> float:
         return self.now
@@ -69,6 +79,19 @@ class Floor(RuleBasedStateMachine):
     @rule(name=NAMES, robot=ROBOTS, to=NAMES)
     def hand_over(self, name: str, robot: int, to: str) -> None:
         self.ask_for("hand_over", name, robot, to)
+
+    @rule(name=NAMES, other=NAMES, robot=ROBOTS, what=st.sampled_from(["give_back", "take", "accept", "reset", "leave"]))
+    def in_the_middle_of_a_timestep(self, name: str, other: str, robot: int, what: str) -> None:
+        """Somebody does something while robots move, and then somebody else wants the robot."""
+        self.meanwhile.append((what, (name,) if what == "leave" else (name, robot)))
+        self.meanwhile.append(("take", (other, robot)))
+
+    @rule(robot=ROBOTS, name=NAMES)
+    def a_reset_that_its_person_does_not_wait_for(self, robot: int, name: str) -> None:
+        hold = self.offers.holds.get(robot)
+        if hold is not None:
+            self.ask_for("reset", hold.lease.operator, robot)
+            self.meanwhile += [("give_back", (hold.lease.operator, robot)), ("take", (name, robot))]
 
     @rule()
     def everybody_accepts(self) -> None:

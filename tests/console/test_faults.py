@@ -16,6 +16,7 @@ from floor import LeaseEnded, Notice, Serving, Stepped, config
 
 from tutelage.console.audit import Audit, RecordError, samples_in, verify_folder
 from tutelage.console.states import Denied
+from tutelage.console.supervision import Supervision
 from tutelage.errors import TutelageError
 from tutelage.fleet.modes import Mode
 
@@ -111,8 +112,8 @@ class TestKilled:
     def test_two_servers_do_not_share_a_folder(self, tmp_path: Path) -> None:
         from tutelage.errors import RunFolderError
 
-        with Serving(config(tmp_path)), pytest.raises(RunFolderError, match="in use"), Serving(config(tmp_path)):
-            pass
+        with Serving(config(tmp_path)) as server, pytest.raises(RunFolderError, match="in use"):
+            Supervision.open(config(tmp_path), server.audit)
 
     def test_a_folder_is_not_served_as_something_else(self, tmp_path: Path) -> None:
         from tutelage.errors import RunFolderError

@@ -136,6 +136,7 @@ class Engine:
         self.people = People(self.offers, self.driver, self.lock, self.clock, config.lockstep, self.operators.used)
         self.reasons = Reasons(parse(run.priority, run.thresholds, run.gate), self.offers, run.queue == "fifo")
         self.desk = Desk(self.people, self.reasons, self.clock, run.t_reset, config.gated)
+        self._version = self._known_version()
         self.learner = self._learner(parts)
         self._shared = None if config.simulated else self._share()
         self.loop = parts.assembly.loop(
@@ -162,7 +163,7 @@ class Engine:
             return None
         notice = lambda level, text: self.herald.tell(Notice(None, level, text))  # noqa: E731
         return ProcessLearner(
-            c.out, parts.learner, self._known_version(), c.per_sample, c.swap_every, c.save_every, notice, self._swapped
+            c.out, parts.learner, self._version, c.per_sample, c.swap_every, c.save_every, notice, self._swapped
         )
 
     @property
@@ -170,7 +171,7 @@ class Engine:
         """How often the policy's weights were replaced."""
         if isinstance(self.learner, ProcessLearner):
             return self.learner.version
-        return self.loop.t if self.learner is not None else 0
+        return self.loop.t if self.learner is not None else self._version
 
     def _known_version(self) -> int:
         """The policy's version before the server was started, from its record."""

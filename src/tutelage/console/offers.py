@@ -123,7 +123,7 @@ class Offers:
         self.offline: Collection[int] = ()
         self.stopped: set[int] = set()
         self.resetting: dict[int, int] = {}
-        """Robots in a hard reset, and the seat that began it: it goes on whatever becomes of the person."""
+        """Robots in a hard reset, and the seat that began it: it goes on whatever becomes of the person. The loop says."""
         self._log, self._wall, self._new_id = log, wall, new_id
         self._events: list[Told] = []
 
@@ -262,12 +262,12 @@ class Offers:
 
     def end(self, robot: int, why: str, now: float) -> None:
         """Whatever there is about a robot ends: its lease, an offer. A hard reset goes on until the loop says it is done."""
-        if why == "reset_done":
-            self.resetting.pop(robot, None)
         self.offers.pop(robot, None)
         self.left_behind.pop(robot, None)
         if robot in self.holds:
             self._end(robot, why, now)
+        if why == "reset_done":
+            self.resetting.pop(robot, None)
 
     def ask(self, order: Sequence[int], reasons: Sequence[str], now: float) -> None:
         """These robots need somebody, the neediest first (of equal ones, whoever has waited longest is to be first).
@@ -370,6 +370,8 @@ class Offers:
         hold = self.holds.pop(robot)
         self.passing.pop(robot, None)
         self._seat(hold.human).free_since = now
+        if hold.reset:  # it may have begun in the timestep that is going on; the loop will tell
+            self.resetting[robot] = hold.human
         with contextlib.suppress(TutelageError):  # it ends in any case
             self._log("lease_end", hold.lease.operator, robot, lease=hold.lease.id, why=why)
         self._events.append(LeaseEnded(hold.lease.operator, robot, hold.lease.id, why, now - hold.since))
