@@ -65,10 +65,11 @@ class Served:
     Args:
         folder: its --out.
         options: further options of the command.
+        seconds: that it may take to begin.
     """
 
-    def __init__(self, folder: Path, *options: str) -> None:
-        self.folder, self.options = folder, options
+    def __init__(self, folder: Path, *options: str, seconds: float = 120.0) -> None:
+        self.folder, self.options, self.seconds = folder, options, seconds
         accounts = Accounts(folder)
         for name, role in PEOPLE.items():
             accounts.add(name, Role.of(role), PASSWORD)
@@ -92,7 +93,7 @@ class Served:
             told.put(None)
 
         threading.Thread(target=read, daemon=True).start()
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + self.seconds
         while True:
             line = told.get(timeout=max(0.1, deadline - time.monotonic()))
             assert line is not None, "\n".join(self.lines)

@@ -140,7 +140,7 @@ def test_a_closed_tab_leaves_a_robot_that_holds_and_asks_again(browser: Any, ser
         ana.close()
         ben.see(".stage-head", re.compile("Holding|Violated"), seconds=2.5)
         ben.page.wait_for_function(
-            "!document.querySelector('.panel')?.textContent.includes('ana has this robot')", timeout=12_000
+            "() => !document.querySelector('.panel')?.textContent.includes('ana has this robot')", timeout=12_000
         )
         ben.see(".waiting-row", "robot 4")
         ben.page.get_by_role("switch").click()
@@ -249,6 +249,24 @@ def test_a_press_on_the_picture_drives(browser: Any, served: Served) -> None:
         ana.see(".arrow line")
         ana.see(".view-live")
         ana.page.mouse.up()
+        ana.page.wait_for_selector(".view-live", state="detached")
+        ana.page.keyboard.press("g")
+        ana.page.wait_for_selector(".stage-mine", state="detached")
+
+
+PAD = """() => {
+  const pad = { connected: true, id: "A pad (Vendor: 1)", axes: [0.9, 0, 0, 0], buttons: [] };
+  navigator.getGamepads = () => [pad];
+}"""
+
+
+def test_a_gamepad_drives(browser: Any, served: Served) -> None:
+    with person(browser, served.origin, "ana") as ana:
+        take(ana, 1)
+        ana.page.evaluate(PAD)
+        ana.see(".view-live")
+        ana.see(".controls", "Gamepad: A pad")
+        ana.page.evaluate("() => { navigator.getGamepads = () => [] }")
         ana.page.wait_for_selector(".view-live", state="detached")
         ana.page.keyboard.press("g")
         ana.page.wait_for_selector(".stage-mine", state="detached")

@@ -58,6 +58,11 @@ export const RIBBON = 90;
 export const history = signal<Uint8Array[]>([]);
 export const historyTick = signal(0);
 
+/** Whether states stopped coming. In lock-step the simulation waits for people: then silence means nothing. */
+export function silent(seconds: number): boolean {
+  return !fleet.value?.lockstep && stateAt.value !== null && now.value - stateAt.value > seconds;
+}
+
 /** The server's clock, s. */
 export function serverNow(): number {
   return Date.now() / 1000 + clockSync.offset;
@@ -118,6 +123,8 @@ export function describe(description: Description): void {
   });
 }
 
+let queueKey = "";
+
 const FIELDS: (keyof Robot)[] = ["look", "mode", "reason", "rank", "online", "stopped", "held", "operator", "waiting", "offeredTo"];
 
 /** Take in a state; robots that did not change keep their object. */
@@ -148,7 +155,11 @@ export function applySnapshot(next: Snapshot): void {
       if (FIELDS.some((field) => fresh[field] !== old[field])) cell.value = fresh;
     });
     snapshot.value = next;
-    queue.value = next.queue;
+    const key = next.queue.map((row) => `${row.robot} ${row.reason} ${row.since} ${row.offered_to}`).join("|");
+    if (key !== queueKey) {
+      queueKey = key;
+      queue.value = next.queue;
+    }
     stateAt.value = Date.now() / 1000;
   });
 }

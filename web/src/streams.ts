@@ -14,7 +14,7 @@ export interface Wish {
   visible: boolean;
 }
 
-const SIZES: [number, number][] = [[160, 90], [320, 180], [480, 270], [640, 360], [960, 540]];
+const SIZES: [number, number][] = [[160, 90], [320, 180], [640, 360], [960, 540]];
 
 /** The smallest picture that fills so many CSS pixels sharply enough. */
 export function sizeFor(cssWidth: number, density: number): [number, number] {

@@ -25,7 +25,7 @@ describe("what is watched", () => {
   });
   it("is as sharp as the screen and not sharper", () => {
     expect(sizeFor(150, 1)).toEqual([160, 90]);
-    expect(sizeFor(240, 2)).toEqual([480, 270]);
+    expect(sizeFor(240, 2)).toEqual([640, 360]);
     expect(sizeFor(4000, 3)).toEqual([960, 540]);
   });
 });

@@ -16,7 +16,7 @@ export function Queue() {
       <h1 class="head">
         Requests <span class="count num">{queue.value.length || ""}</span>
       </h1>
-      <div class="offers" aria-live="assertive" aria-relevant="additions">
+      <div class="offers">
         {mine.map(([robot, offer], k) => (
           <Offer key={robot} robot={robot} reason={offer.reason} until={offer.until} seconds={offer.seconds} first={k === 0} />
         ))}

@@ -119,7 +119,7 @@ export function View({ frame, index, camera, stats, mine }: { frame: { current: 
       }
     : {};
   const drag = held.value.drag;
-  const tooOld = old.value !== null && old.value > 1;
+  const tooOld = old.value !== null && old.value > 1 && !store.fleet.value?.lockstep;
   return (
     <div
       ref={frame}

@@ -13,7 +13,7 @@ import { Picture } from "../parts/Picture";
 import { Banner, Link, signOut } from "../parts/Shell";
 import type { StudyState } from "../protocol";
 import * as store from "../store";
-import { noStats, type ViewStats } from "../video";
+import { addView, noStats, type ViewStats } from "../video";
 import { Cards } from "./Cards";
 import { Controls } from "./Controls";
 import { askReset, View } from "./Stage";
@@ -157,6 +157,7 @@ function Keys() {
 /** Cards and robots are two screens; switching between them is part of what is studied. */
 function Switching({ state }: { state: StudyState }) {
   const practice = state.steps === null;
+  useWatched(store.robots.value.length);
   return (
     <>
       <div class="study-bar">
@@ -176,6 +177,16 @@ function Switching({ state }: { state: StudyState }) {
       {screen.value === "cards" ? state.board ? <Cards board={state.board} /> : null : <Help state={state} />}
     </>
   );
+}
+
+/** Robots are watched behind the cards, too: the picture is there at once when somebody goes to them. */
+function useWatched(robots: number): void {
+  useEffect(() => {
+    const gone = Array.from({ length: robots }, (_, robot) =>
+      addView({ robot, camera: 0, width: 320, fps: 2, priority: 0, visible: true, canvas: document.createElement("canvas"), stats: signal(noStats()) }),
+    );
+    return () => gone.forEach((end) => end());
+  }, [robots]);
 }
 
 function Keyboard() {

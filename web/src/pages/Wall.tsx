@@ -2,7 +2,7 @@
 
 import { signal, type Signal } from "@preact/signals";
 import { useState } from "preact/hooks";
-import { reasonShort } from "../modes";
+import { LOOK_TEXT, reasonShort, reasonText } from "../modes";
 import { Mode } from "../parts/Glyph";
 import { Picture } from "../parts/Picture";
 import { Ribbon } from "../parts/Ribbon";
@@ -83,7 +83,7 @@ export function Wall() {
       </div>
       <ul class={`wall wall-${size}`}>
         {order(robots.value).map((cell) => (
-          <Tile key={cell.value.index} cell={cell} fps={FPS[size]} camera={Math.min(camera.value, Math.max(0, cameras.length - 1))} />
+          <Tile key={cell.peek().index} cell={cell} fps={FPS[size]} camera={Math.min(camera.value, Math.max(0, cameras.length - 1))} />
         ))}
       </ul>
     </section>
@@ -98,7 +98,7 @@ export function Tile({ cell, fps, camera }: { cell: Signal<Robot>; fps: number; 
   const quietLook = robot.look === "auto" || robot.look === "offline";
   return (
     <li class={`tile look-${robot.look} ${needs ? "tile-needs" : ""} ${quietLook ? "" : "tile-loud"}`}>
-      <a href={`#/robot/${robot.index}`} aria-label={`${robot.name}`}>
+      <a href={`#/robot/${robot.index}`} aria-label={[robot.name, LOOK_TEXT[robot.look], who, needs ? reasonText(robot.reason) : ""].filter(Boolean).join(", ")}>
         <div class="tile-picture">
           <Picture robot={robot.index} camera={camera} fps={fps} priority={needs || robot.operator ? 1 : 0} label={`Picture of ${robot.name}`} stats={stats} />
           <Age stats={stats} />
@@ -124,6 +124,7 @@ export function withWhom(robot: Robot): string | undefined {
 function Age({ stats }: { stats: Signal<ViewStats> }) {
   const captured = stats.value.captured;
   if (captured === null) return <span class="tile-age">no picture yet</span>;
+  if (fleet.value?.lockstep) return null; // the simulation waits for people, and so do its pictures
   const age = now.value + clockSync.offset - captured;
   return age > 3 ? <span class="tile-age tile-old">{age < 100 ? `${Math.round(age)} s old` : "old picture"}</span> : null;
 }

@@ -97,7 +97,7 @@ function Tab({ page, text, path, badge = 0 }: { page: string; text: string; path
 
 export function Link() {
   const kind = store.connection.value.kind;
-  const late = store.stateAt.value !== null && store.now.value - store.stateAt.value > 1.5;
+  const late = store.silent(1.5);
   const bad = kind !== "open" || late;
   const text = kind === "open" ? (late ? "no state" : milliseconds(store.rtt.value === null ? null : store.rtt.value * 1000)) : kind === "lost" ? "offline" : "connecting";
   return (
@@ -264,10 +264,10 @@ export function Banner() {
       </div>
     );
   }
-  if (state.kind === "open" && store.stateAt.value !== null && store.now.value - store.stateAt.value > 2) {
+  if (state.kind === "open" && store.silent(2)) {
     return (
       <div class="banner banner-warn" role="alert">
-        Nothing was heard from the loop for {Math.round(store.now.value - store.stateAt.value)} s: what you see is old.
+        Nothing was heard from the loop for {Math.round(store.now.value - (store.stateAt.value ?? 0))} s: what you see is old.
       </div>
     );
   }

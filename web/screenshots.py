@@ -1,0 +1,148 @@
+"""Pictures of every page of the console, light and dark, on a desk and on a phone:
+
+    python web/screenshots.py [--fleet sim:PegInsertion] [--robots 12] [--seconds 60] [--out web/shots]
+
+Starts `tutelage serve` in a temporary folder, lets two programs help as operators for a while so that there is something to see,
+and takes over a robot itself. Needs Chromium and playwright.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "src"), str(ROOT / "tests" / "console")]
+os.environ["PYTHONPATH"] = str(ROOT / "src")
+
+from browsing import DESKTOP, PASSWORD, PHONE, Person, Served, chromium  # noqa: E402
+
+from tutelage.console.scripted import ScriptedOperator, after  # noqa: E402
+from tutelage.errors import TutelageError  # noqa: E402
+
+UNTENDED = ".look-auto, .look-asking"
+SIZES = {"desktop": DESKTOP, "phone": PHONE}
+
+
+@contextlib.contextmanager
+def helpers(origin: str, names: list[str]) -> Iterator[None]:
+    """Operators that are programs, at work until the end."""
+    stop = threading.Event()
+
+    def work(name: str) -> None:
+        while not stop.is_set():
+            operator = ScriptedOperator(origin, name, PASSWORD, react=1.5, rule=after(60))
+            with contextlib.suppress(TutelageError):
+                asyncio.run(operator.run(until=stop.is_set))
+
+    threads = [threading.Thread(target=work, args=(name,)) for name in names]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+def shoot(browser: Any, origin: str, out: Path, size: str, scheme: str) -> None:
+    """Every page, once."""
+
+    def save(name: str) -> None:
+        somebody.page.screenshot(path=out / f"{name}-{size}-{scheme}.png")
+
+    somebody = Person(browser, origin, None, color_scheme=scheme, **SIZES[size])
+    page = somebody.page
+    page.wait_for_selector(".login")
+    save("login")
+    somebody.sign_in("ada")
+    page.wait_for_timeout(5000)
+    save("wall")
+    if size == "phone":
+        somebody.go("/queue")
+        page.wait_for_timeout(800)
+        save("queue")
+        somebody.go("/more")
+        page.wait_for_timeout(400)
+        save("more")
+    else:
+        page.locator(".person summary").click()
+        page.wait_for_timeout(300)
+        save("menu")
+        page.keyboard.press("Escape")
+    for name in ("charts", "operators", "accounts"):
+        somebody.go(f"/{name}")
+        page.wait_for_timeout(1500)
+        save(name)
+    somebody.go("/audit")
+    page.get_by_role("button", name="Verify the chain").click()
+    page.wait_for_timeout(1500)
+    save("audit")
+    somebody.go("/replay")
+    page.wait_for_selector(".page.replay")
+    with contextlib.suppress(Exception):
+        page.locator(".episodes a").nth(1).click(timeout=3000)
+        page.wait_for_selector(".player img", timeout=10_000)
+        page.get_by_label("Timestep", exact=True).press("PageUp")
+        page.wait_for_timeout(1500)
+    save("replay")
+    somebody.go("/")
+    page.wait_for_timeout(500)
+    robot = page.evaluate(
+        """() => [...document.querySelectorAll('.tile')].findIndex(t => t.matches('.look-auto, .look-asking'))"""
+    )
+    somebody.go(f"/robot/{max(0, robot)}")
+    page.wait_for_timeout(1500)
+    save("robot")
+    with contextlib.suppress(Exception):
+        page.get_by_role("button", name="Take over").or_(page.locator(".panel .button.primary")).last.click(timeout=3000)
+        page.wait_for_selector(".stage-mine", timeout=5000)
+        page.locator(".view").focus()
+        page.keyboard.down("ArrowRight")
+        page.wait_for_timeout(900)
+        save("drive")
+        page.keyboard.up("ArrowRight")
+        page.keyboard.press("h")
+        page.wait_for_timeout(400)
+        save("reset")
+        page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
+        page.keyboard.press("g")
+        page.wait_for_timeout(800)
+    for line in somebody.complaints:
+        print(f"{size} {scheme}: {line}", file=sys.stderr)
+    somebody.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fleet", default="sim:PegInsertion")
+    parser.add_argument("--robots", type=int, default=12)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of work before the first picture")
+    parser.add_argument("--out", type=Path, default=ROOT / "web" / "shots")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, chromium() as browser, contextlib.ExitStack() as stack:
+        server = Served(
+            Path(folder), "--fleet", arguments.fleet, "--robots", str(arguments.robots), "--humans", "4", seconds=900
+        )
+        stack.callback(server.close)
+        stack.enter_context(helpers(server.origin, ["ana", "ben"]))
+        time.sleep(arguments.seconds)
+        for size in SIZES:
+            for scheme in ("light", "dark"):
+                shoot(browser, server.origin, arguments.out, size, scheme)
+    print(f"{len(list(arguments.out.glob('*.png')))} pictures in {arguments.out}")
+
+
+if __name__ == "__main__":
+    main()
