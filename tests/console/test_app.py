@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import threading
 import time
 from pathlib import Path
 
@@ -259,6 +260,28 @@ def test_a_slow_page_gets_the_newest_state_and_no_backlog(running: Running) -> N
                     state = message if message["type"] == "state" else state
             assert running.supervision.snapshot().t - state["t"] <= 4
             assert len(ana.seen) - seen < 40
+
+
+def test_an_emergency_stop_waits_for_nothing_else(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many other requests hang."""
+    let_go = threading.Event()
+    monkeypatch.setattr(running.supervision, "available", lambda operator, yes: let_go.wait(20))
+    cookie = running.cookie("ana")
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(running.socket("ana", cookie=cookie)) for _ in range(6)]
+        for socket in sockets:
+            socket.hear("hello")
+            socket.say("available", yes=True, ref=1)
+        time.sleep(0.2)
+        with contextlib.closing(running.client("operator")) as client:
+            began = time.monotonic()
+            assert client.post("/api/estop", json={"robot": 2}).status_code == 200
+            assert time.monotonic() - began < 1
+            assert running.supervision.stopped[2]
+            assert client.post("/api/estop/clear", json={"robot": 2}).status_code == 200
+        let_go.set()
+        for socket in sockets:
+            socket.hear("ack", ref=1)
 
 
 def test_a_full_disk_refuses_what_must_be_recorded_and_lets_people_look(tmp_path: Path) -> None:

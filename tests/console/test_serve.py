@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import ipaddress
+import json
 import re
 import signal
 import socket
@@ -18,6 +19,7 @@ from pathlib import Path
 import httpx
 import pytest
 from consoles import PASSWORD
+from websockets.sync.client import connect
 
 from tutelage.console.audit import verify_folder
 
@@ -156,6 +158,36 @@ def test_a_port_that_is_taken_is_told_before_anything_is_prepared(tmp_path: Path
     assert said.stdout == ""
 
 
+def test_behind_a_proxy_nobody_counts_as_local(tmp_path: Path, serving: list[Served]) -> None:
+    tutelage("accounts", "add", "ana", "--role", "admin", "--out", tmp_path, input=PASSWORD)
+    serving.append(server := Served(tmp_path, "--origin", "https://robots.example", "--port", free := free_port()))
+    assert server.address == "https://robots.example"
+    server.address = f"http://127.0.0.1:{free}"
+    headers = {"host": "robots.example", "origin": "https://robots.example", "x-tutelage": "1"}
+    answer = httpx.post(f"{server.address}/api/login", json={"name": "ana", "password": PASSWORD}, headers=headers)
+    assert answer.status_code == 200
+    assert "; secure" in answer.headers["set-cookie"].lower()
+    assert httpx.get(f"{server.address}/metrics", headers=headers).status_code == 401
+    cookies = {"tutelage_session": answer.cookies["tutelage_session"]}
+    assert httpx.get(f"{server.address}/metrics", headers=headers, cookies=cookies).status_code == 200
+    setup = {"token": "x" * 43, "name": "eve", "password": PASSWORD}
+    assert httpx.post(f"{server.address}/api/setup", json=setup, headers=headers).status_code == 403
+    assert httpx.get(f"{server.address}/healthz", headers={"host": "evil.example"}).status_code == 421
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        return int(listening.getsockname()[1])
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6 here")
+def test_the_loopback_address_of_ipv6_will_do(tmp_path: Path, serving: list[Served]) -> None:
+    serving.append(server := Served(tmp_path, "--host", "::1"))
+    assert server.address.startswith("http://[::1]:")
+    assert httpx.get(server.address + "/healthz").status_code == 200
+    assert server.post("/api/login", {"name": "ana", "password": PASSWORD}).status_code == 401
+
+
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A certificate of this machine and its key."""
@@ -200,6 +232,10 @@ def test_other_addresses_need_accounts_and_speak_tls(
     assert answer.status_code == 200
     assert "; secure" in answer.headers["set-cookie"].lower()
     assert answer.headers["strict-transport-security"]
+    cookie = f"tutelage_session={answer.cookies['tutelage_session']}"
+    live = server.address.replace("https", "wss") + "/api/live"
+    with connect(live, origin=server.address, additional_headers={"cookie": cookie}, ssl=trust) as socket_:  # type: ignore[arg-type]
+        assert json.loads(socket_.recv(10))["type"] == "hello"
     with pytest.raises(httpx.HTTPError):
         httpx.get(server.address.replace("https", "http") + "/healthz")
     assert server.stop()[0] == 0

@@ -18,7 +18,7 @@ except ModuleNotFoundError:
 
 from tutelage.console import account_api, fleet_api, site
 from tutelage.console.audit import RecordError
-from tutelage.console.context import Context, has_webrtc, log
+from tutelage.console.context import BusyError, Context, has_webrtc, log
 from tutelage.console.hub import Hub
 from tutelage.console.live import LiveSocket
 from tutelage.console.messages import problem
@@ -105,7 +105,7 @@ def _answer_errors(app: FastAPI) -> None:
     async def ours(request: Request, error: TutelageError) -> JSONResponse:
         if isinstance(error, Denied):
             return JSONResponse({"error": error.text, "code": error.code}, 409)
-        return JSONResponse({"error": str(error)}, 503 if isinstance(error, RecordError) else 400)
+        return JSONResponse({"error": str(error)}, 503 if isinstance(error, RecordError | BusyError) else 400)
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> JSONResponse:

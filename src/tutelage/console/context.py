@@ -17,6 +17,7 @@ from tutelage.console.accounts import Accounts, Role, Session
 from tutelage.console.audit import Audit
 from tutelage.console.limits import is_loopback
 from tutelage.console.security import COOKIE, Site
+from tutelage.errors import TutelageError
 
 if TYPE_CHECKING:
     from tutelage.console.study import Study
@@ -27,6 +28,10 @@ T = TypeVar("T")
 STATIC = Path(__file__).parent / "static"
 
 
+class BusyError(TutelageError):
+    """Too much of one kind of work waits already."""
+
+
 class Pool:
     """A few threads for one kind of work, and a bounded queue before them, so that one kind cannot starve another."""
 
@@ -35,9 +40,9 @@ class Pool:
         self._free = threads + waiting
 
     async def run(self, call: Callable[..., T], *args: Any) -> T:
-        """`call(*args)` in a thread. Raises HTTPException 503 where too many wait."""
+        """`call(*args)` in a thread. Raises BusyError where too many wait."""
         if self._free <= 0:
-            raise HTTPException(503, "too busy; try again")
+            raise BusyError("too busy; try again")
         self._free -= 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._executor, lambda: call(*args))
@@ -63,6 +68,7 @@ class Context:
         study: the session of a user study, whose robots change from part to part; None: there is no study.
         logins: threads that hash passwords.
         control: those that carry out what people ask.
+        stops: those of emergency stops, which wait for nothing else.
         slow: those that read the record and episodes.
         verifying: the one that waits for a verification of the record.
     """
@@ -76,12 +82,13 @@ class Context:
     study: Study | None = None
     logins: Pool = field(default_factory=lambda: Pool("login", 2, 16))
     control: Pool = field(default_factory=lambda: Pool("control", 4, 256))
+    stops: Pool = field(default_factory=lambda: Pool("stops", 2, 256))
     slow: Pool = field(default_factory=lambda: Pool("slow", 2, 32))
     verifying: Pool = field(default_factory=lambda: Pool("verifying", 1, 4))
 
     def close(self) -> None:
         """End the threads."""
-        for pool in (self.logins, self.control, self.slow, self.verifying):
+        for pool in (self.logins, self.control, self.stops, self.slow, self.verifying):
             pool.close()
 
 

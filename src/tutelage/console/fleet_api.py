@@ -133,7 +133,7 @@ async def episode_frame(
 async def estop(request: Request, who: Operator, body: Which) -> dict[str, Any]:
     """Stop a robot, or all of them, at once."""
     c = context_of(request)
-    await c.control.run(c.supervision.estop, who.name, body.robot)
+    await c.stops.run(c.supervision.estop, who.name, body.robot)
     return {}
 
 
@@ -141,7 +141,7 @@ async def estop(request: Request, who: Operator, body: Which) -> dict[str, Any]:
 async def clear_estop(request: Request, who: Operator, body: Which) -> dict[str, Any]:
     """Let it go on."""
     c = context_of(request)
-    await c.control.run(c.supervision.clear_estop, who.name, body.robot)
+    await c.stops.run(c.supervision.clear_estop, who.name, body.robot)
     return {}
 
 

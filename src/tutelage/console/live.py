@@ -11,7 +11,7 @@ from starlette.websockets import WebSocket
 
 from tutelage.console import messages
 from tutelage.console.accounts import Role, Session
-from tutelage.console.context import log
+from tutelage.console.context import BusyError, log
 from tutelage.console.fleet_api import describe
 from tutelage.console.hub import Hub, message_of, state_message
 from tutelage.console.limits import Bucket
@@ -126,6 +126,8 @@ class LiveSocket(Socket):
         except Denied as denied:
             self._dropped += isinstance(said, messages.Command)
             self.refuse(denied.code, denied.text, said.ref)
+        except BusyError as busy:
+            self.refuse("too_many", str(busy), said.ref)
         except TutelageError as problem:
             self.refuse("held", str(problem), said.ref)
         except Exception:
@@ -141,7 +143,7 @@ class LiveSocket(Socket):
             case messages.HandOver():
                 await run(s.hand_over, me, said.robot, said.to)
             case messages.Stop():
-                await run(s.estop if said.type == "estop" else s.clear_estop, me, said.robot)
+                await self.context.stops.run(s.estop if said.type == "estop" else s.clear_estop, me, said.robot)
             case messages.Available():
                 if me not in self.hub.seats and said.yes:
                     no_seat = await self.hub.sit(me)
