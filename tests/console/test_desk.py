@@ -86,12 +86,19 @@ class Floor(RuleBasedStateMachine):
         self.meanwhile.append((what, (name,) if what == "leave" else (name, robot)))
         self.meanwhile.append(("take", (other, robot)))
 
-    @rule(robot=ROBOTS, name=NAMES)
-    def a_reset_that_its_person_does_not_wait_for(self, robot: int, name: str) -> None:
-        hold = self.offers.holds.get(robot)
-        if hold is not None:
+    @rule(robot=ROBOTS)
+    def everybody_wants_it(self, robot: int) -> None:
+        for name in ("ann", "bob", "eve"):
+            self.ask_for("join", name)
+            self.ask_for("take", name, robot)
+
+    @rule(what=st.sampled_from(["give_back", "leave", "reset"]))
+    def resets_that_people_do_not_wait_for(self, what: str) -> None:
+        for robot, hold in self.offers.holds.items():
+            self.meanwhile.append((what, (hold.lease.operator,) if what == "leave" else (hold.lease.operator, robot)))
+            self.meanwhile += [("take", (name, robot)) for name in ("kim", "eve", "bob", "ann")]
+        for robot, hold in list(self.offers.holds.items()):
             self.ask_for("reset", hold.lease.operator, robot)
-            self.meanwhile += [("give_back", (hold.lease.operator, robot)), ("take", (name, robot))]
 
     @rule()
     def everybody_accepts(self) -> None:
