@@ -273,6 +273,12 @@ def test_an_emergency_stop_waits_for_nothing_else(running: Running, monkeypatch:
             socket.hear("hello")
             socket.say("available", yes=True, ref=1)
         time.sleep(0.2)
+        sockets[0].say("estop", robot=1, ref="stop")
+        sockets[0].say("estop_clear", robot=1, ref="clear")
+        sockets[0].say("estop", robot=1, ref="again")
+        sockets[0].hear("ack", timeout=1, ref="again")
+        assert running.supervision.stopped[1]
+        running.supervision.stopped[1] = False
         with contextlib.closing(running.client("operator")) as client:
             began = time.monotonic()
             assert client.post("/api/estop", json={"robot": 2}).status_code == 200
@@ -282,6 +288,21 @@ def test_an_emergency_stop_waits_for_nothing_else(running: Running, monkeypatch:
         let_go.set()
         for socket in sockets:
             socket.hear("ack", ref=1)
+
+
+def test_what_a_page_said_before_it_went_is_done(running: Running) -> None:
+    for k in range(10):
+        with running.socket("ana") as ana:
+            ana.hear("hello")
+            ana.say("take", robot=3)
+            ana.say("give_back", robot=3)
+            ana.say("estop", robot=k % 4)
+            ana.connection.close()
+        wait_until(lambda: running.supervision.stopped.any())
+        assert running.supervision.stopped.tolist() == [robot == k % 4 for robot in range(4)]
+        wait_until(lambda: running.supervision.calls[-1][:2] == ("ana", "leave"))
+        assert 3 not in running.supervision.leases
+        running.supervision.stopped[:] = False
 
 
 def test_a_full_disk_refuses_what_must_be_recorded_and_lets_people_look(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import time
 from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +26,9 @@ from tutelage.errors import TutelageError
 WAITING_MAX = 512
 """Events that a slow page may have before it; then it is told to come back and see the newest."""
 HISTORY = 600
+FINISH_SECONDS = 5.0
+ASKED_MAX = 64
+"""Requests of one page that wait to be carried out."""
 
 
 class LiveSocket(Socket):
@@ -35,7 +41,10 @@ class LiveSocket(Socket):
         self.hub = hub
         self._events: deque[str] = deque()
         self._state: str | None = None
-        self._stops = Bucket(20.0, 40)
+        self._stop_rate = Bucket(20.0, 40)
+        self._asked: asyncio.Queue[Any] = asyncio.Queue(ASKED_MAX)
+        self._stops: asyncio.Queue[Any] = asyncio.Queue(ASKED_MAX)
+        self._doing: set[asyncio.Future[None]] = set()
         self._delays: deque[float] = deque(maxlen=500)
         self._commands = self._dropped = 0
         self._next_link = time.monotonic() + 1
@@ -84,6 +93,13 @@ class LiveSocket(Socket):
             self.refuse("no_seat", no_seat)
 
     async def finish(self) -> None:
+        """What the page said before it went is done, stops first."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FINISH_SECONDS):
+                await asyncio.gather(*self._doing)
+                for queue in (self._stops, self._asked):
+                    while not queue.empty():
+                        await self._carry_out(queue.get_nowait())
         await self.hub.leave(self)
 
     async def check(self) -> None:
@@ -99,30 +115,59 @@ class LiveSocket(Socket):
     # -- from the page ------------------------------------------------------------------------------------------
 
     def exempt(self, message: str) -> bool:
-        return '"estop"' in message and self._stops.take()
+        return '"estop"' in message and self._stop_rate.take()
+
+    def more(self) -> Sequence[Callable[[], Coroutine[Any, Any, None]]]:
+        return (lambda: self._work(self._asked), lambda: self._work(self._stops))
 
     async def received(self, message: str) -> None:
         began = time.perf_counter()
         said = messages.parse_live(message)
         if isinstance(said, messages.Ping):
             self.tell(text({"type": "pong", "n": said.n, "time": said.time, "server_time": time.time()}))
-            return
-        if not self.helps:
+        elif not self.helps:
             self.refuse("forbidden", "viewers look only", said.ref)
+        elif isinstance(said, messages.Command | messages.Renew):
+            with self._refusing(said):
+                self._at_once(said, began)
+        else:
+            queue = self._stops if isinstance(said, messages.Stop) else self._asked
+            try:
+                queue.put_nowait(said)
+            except asyncio.QueueFull:
+                self.refuse("too_many", "too many requests wait", said.ref)
+
+    def _at_once(self, said: messages.Command | messages.Renew, began: float) -> None:
+        """What comes many times a second, and waits for nothing."""
+        if isinstance(said, messages.Renew):
+            self.context.supervision.renew(self.name, said.lease)
             return
+        self._commands += 1
+        used = self.context.supervision.command(
+            self.name, said.robot, said.lease, said.seq, said.action, said.assist, said.push
+        )
+        self._dropped += not used
+        self._delays.append(1000 * (time.perf_counter() - began))
+
+    async def _work(self, queue: asyncio.Queue[Any]) -> None:
+        """Do what was asked for, in its order. Stops and their ends have an order of their own, which nothing holds up."""
+        while True:
+            said = await queue.get()
+            task = asyncio.ensure_future(self._carry_out(said))
+            self._doing.add(task)
+            task.add_done_callback(self._doing.discard)
+            await asyncio.shield(task)  # what was begun is done, though the page may be gone
+
+    async def _carry_out(self, said: Any) -> None:
+        with self._refusing(said):
+            await self._do(said)
+            self.tell(text({"type": "ack", "ref": said.ref}))
+
+    @contextlib.contextmanager
+    def _refusing(self, said: Any) -> Iterator[None]:
+        """Say why something was not done."""
         try:
-            if isinstance(said, messages.Command):
-                self._commands += 1
-                used = self.context.supervision.command(
-                    self.name, said.robot, said.lease, said.seq, said.action, said.assist, said.push
-                )
-                self._dropped += not used
-                self._delays.append(1000 * (time.perf_counter() - began))
-            elif isinstance(said, messages.Renew):
-                self.context.supervision.renew(self.name, said.lease)
-            else:
-                await self._do(said)
-                self.tell(text({"type": "ack", "ref": said.ref}))
+            yield
         except Denied as denied:
             self._dropped += isinstance(said, messages.Command)
             self.refuse(denied.code, denied.text, said.ref)

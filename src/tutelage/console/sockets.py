@@ -7,6 +7,8 @@ import contextlib
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -70,6 +72,10 @@ class Socket(ABC):
             self._end = code, why
         self.wake.set()
 
+    def more(self) -> Sequence[Callable[[], Coroutine[Any, Any, None]]]:
+        """What else goes on while the socket is open."""
+        return ()
+
     def exempt(self, message: str) -> bool:
         """Whether a message is read even in a flood."""
         return False
@@ -81,7 +87,7 @@ class Socket(ABC):
         tasks: list[asyncio.Task[None]] = []
         try:
             await self.begin()
-            tasks = [asyncio.create_task(part()) for part in (self._receive, self._send, self._check)]
+            tasks = [asyncio.create_task(part()) for part in (self._receive, self._send, self._check, *self.more())]
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
