@@ -1,4 +1,4 @@
-"""One fleet of processes for the tests of a module: a router and three robots, all of them at 20 Hz."""
+"""One fleet of processes for the tests: a router and three robots, all of them at 20 Hz."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from remote.field import Field
 from tutelage.remote.fleet import RemoteFleet
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
     pytest.importorskip("zenoh", reason="needs the extra sgc")
     with Field(tmp_path_factory.mktemp("field"), 3) as made:

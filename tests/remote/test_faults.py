@@ -282,10 +282,11 @@ def test_a_driver_that_fails_for_a_moment_is_waited_for_and_one_that_goes_on_fai
     trouble.unlink()
 
 
-def test_told_to_end_a_robot_holds_and_exits_with_0(field: Field, fleet: RemoteFleet) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_told_to_end_a_robot_holds_and_exits_with_0(field: Field, fleet: RemoteFleet, number: signal.Signals) -> None:
     all_move(fleet)
     robot = field.robots[2]
-    robot.send_signal(signal.SIGTERM)
+    robot.send_signal(number)
     assert robot.wait(10) == 0, said(robot)
     assert field.notes(2)[-1].what == "hold"
     assert said(robot).endswith("robot-2: ended\n")

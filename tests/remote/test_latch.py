@@ -30,6 +30,17 @@ def test_it_stops_at_once_and_stays_stopped_until_it_is_cleared(tmp_path: Path) 
     assert said == ["stop", "again", "clear"]
 
 
+def test_it_holds_where_it_cannot_be_written_down(tmp_path: Path) -> None:
+    said: list[str] = []
+    made = latch(tmp_path / "file" / "folder", said)
+    (tmp_path / "file").write_text("in the way")
+    made.take(message(1))
+    assert made.stopped
+    made.take(message(2, StopOperation.CLEAR))
+    assert not made.stopped
+    assert said == ["stop", "clear"]
+
+
 def test_a_late_clear_does_not_undo_a_newer_stop(tmp_path: Path) -> None:
     made = latch(tmp_path, [])
     made.take(message(2))

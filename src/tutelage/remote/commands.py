@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -65,6 +66,8 @@ def robot(
         raise ConfigError(f"pictures are 16 to 4096 pixels wide and high, not {size[0]} x {size[1]}")
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(until_stopped())
+        if hasattr(signal, "SIGHUP"):  # the terminal is gone: hold, then end
+            signal.signal(signal.SIGHUP, lambda number, frame: stop.set())
         node = stack.enter_context(Node.open(home))
         driver = make_driver(env, render=cameras, size=size)
         stack.callback(getattr(driver, "close", lambda: None))
@@ -75,7 +78,8 @@ def robot(
             own = stack.enter_context(PulledPolicy(node))
 
         def report(line: str) -> None:
-            print(f"{node.name}: {line}", flush=True)
+            with contextlib.suppress(OSError):  # nobody reads it any more; the robot goes on
+                print(f"{node.name}: {line}", flush=True)
 
         running = stack.enter_context(Robot(node, driver, config, report, own))
         if health is not None:
@@ -167,8 +171,9 @@ def _leave(status: int) -> None:
     Threads that still wait inside of the network's library would be torn out of it by the interpreter's own way to end, and
     abort the program ("FATAL: exception not rethrown"), now and then: whoever started it would take that for a crash.
     """
-    sys.stdout.flush()
-    sys.stderr.flush()
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.flush()
     os._exit(status)
 
 

@@ -40,8 +40,8 @@ class Driver(Protocol):
     * `reset(hard: bool, seed: int | None) -> None`: bring the robot into an initial state; hard: after a violation, which
       may need a person on the spot. May take its time; returns when the robot is ready. Without it, the fleet can only
       begin new episodes where the robot stands.
-    * `stop() -> None`: the emergency stop. Called at once, from another thread, also while `send_action` runs; and once more
-      after that. Without it, `hold` is called.
+    * `stop() -> None`: the emergency stop. Called at once, from another thread, also while `send_action` runs; and again
+      after that, many times. Without it, `hold` is called.
     * `release() -> None`: the emergency stop was cleared.
     * `violation()`, `success()`, `truncated() -> bool`: see `Fleet`. What ended an episode is said until the next reset.
     * `reward() -> float`: of the last step.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 
+from tutelage.errors import TutelageError
 from tutelage.files import write_atomic
 from tutelage.remote.wire import Counts, Malformed, StopOperation, unpack_stop
 
@@ -74,13 +74,15 @@ class Latch:
         if self._file is not None and not self._file.exists():
             try:
                 write_atomic(self._file, b"emergency stop; the server clears it\n")
-            except OSError as error:
+            except TutelageError as error:  # the disk is full, for instance
                 log.warning("the emergency stop holds, but would not outlast this program: %s", error)
 
     def _clear(self) -> None:
         if self._file is not None:
-            with contextlib.suppress(FileNotFoundError):
-                self._file.unlink()
+            try:
+                self._file.unlink(missing_ok=True)
+            except OSError as error:
+                log.warning("the emergency stop is cleared, but will be back after the next start: %s", error)
         if self._stopped:
             self._stopped = False
             self._on_clear()

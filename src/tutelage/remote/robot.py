@@ -161,6 +161,7 @@ class Robot:
         self._last_action: Array | None = None
         self._executed = (0, 0)  # server, number
         self._held = True
+        self._warned = False
         self._told: Any = None
         self._told_at = float("-inf")
         self._failing_since: float | None = None
@@ -310,6 +311,12 @@ class Robot:
             self._failed(error)
             return
         now = time.monotonic()
+        if self.gate.period > 0.8 * self.config.watchdog and not self._warned:
+            self._warned = True
+            self._report(
+                f"the server commands every {self.gate.period:g} s, and the watchdog is {self.config.watchdog:g} s: "
+                f"this robot will hold between two commands; give it --watchdog {3 * self.gate.period:g}"
+            )
         watched = self.gate.watch if now - self.gate.heard_at < WATCHED else 0
         # A robot that is faster than its server need not tell it more often than twice a step, without news.
         news = (self._executed, self._flags(), self._episode)
