@@ -55,6 +55,7 @@ class TrialConfig:
         random: threshold of the Random term.
         learner: whether the policy learns from them.
         observation: what the policy sees.
+        pairs: state-action pairs of the demonstrations before the trial; None: the task's own.
     """
 
     task: str = "BlockPushing"
@@ -70,14 +71,20 @@ class TrialConfig:
     random: float | None = None
     learner: bool = True
     observation: str = "state"
+    pairs: int | None = None
 
     def engine(self, out: Path) -> EngineConfig:
         """The server's settings."""
-        thresholds = PriorityConfig() if self.random is None else PriorityConfig(random=self.random)
+        thresholds = PriorityConfig(initial=0)  # no time without hard resets: a trial is too short for that
+        if self.random is not None:
+            thresholds = dataclasses.replace(thresholds, random=self.random)
         return EngineConfig(
             f"sim:{self.task}", self.robots, self.humans, self.priority, hz=self.hz, lockstep=True, seed=self.seed, out=out,
             learner="process" if self.learner else "none", t_reset=self.t_reset, replay=False,
-            run={"thresholds": thresholds, "observation": self.observation, "threads": 1, "torch_threads": 1},
+            run={
+                "thresholds": thresholds, "observation": self.observation, "offline_pairs": self.pairs,
+                "threads": 1, "torch_threads": 1,
+            },
         )  # fmt: skip
 
 
@@ -117,7 +124,9 @@ def trial(config: TrialConfig, out: Path) -> dict[str, Any]:
                 return made[0].snapshot().t >= config.steps or time.monotonic() > end
 
             people = [
-                ScriptedOperator(f"http://127.0.0.1:{port}", name, passwords[name], config.react, rule=after(config.t_teleop))
+                ScriptedOperator(
+                    f"http://127.0.0.1:{port}", name, passwords[name], config.react, rule=after(config.t_teleop)
+                )
                 for name in names
             ]
 
