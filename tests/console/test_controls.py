@@ -126,6 +126,18 @@ def test_bad_pushes_are_refused(push: Any) -> None:
     assert denied.value.code == "bad_command"
 
 
+def test_a_task_that_somebody_made_of_one_of_ours_is_driven_like_it() -> None:
+    from tutelage.envs.mujoco_fleet import MujocoFleet
+    from tutelage.envs.tasks import PegInsertion
+
+    class Mine(PegInsertion):
+        name = "Mine"
+
+    fleet = MujocoFleet(Mine(), 1, threads=1)
+    assert controls_of("my_pkg:robots", fleet, assist=False).axes[4].label == "gripper"
+    fleet.close()
+
+
 def test_a_fleet_of_somebody_else_has_an_axis_for_each_number() -> None:
     from fakes import PointFleet
 

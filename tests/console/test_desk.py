@@ -179,5 +179,5 @@ class Floor(RuleBasedStateMachine):
         EventLog(Events.concatenate([step.events for step in self.steps]), N, M, self.loop.t)
 
 
-Floor.TestCase.settings = settings(max_examples=200, stateful_step_count=40, deadline=None)
+Floor.TestCase.settings = settings(max_examples=500, stateful_step_count=40, deadline=None)
 TestFloor = Floor.TestCase

@@ -192,10 +192,11 @@ def controls_of(task: str, fleet: Fleet, assist: bool) -> Controls:
 
     Args:
         task: its name.
-        fleet: whose robots.
+        fleet: whose robots, not wrapped. One that is made by a function of somebody's says itself what its task is a kind of.
         assist: whether there is an algorithmic human.
     """
-    made = _TASKS.get(task)
+    kinds = [getattr(kind, "name", "") for kind in type(getattr(fleet, "task", None)).__mro__]
+    made = next((_TASKS[name] for name in (task, *kinds) if name in _TASKS), None)
     if made is not None:
         return made(assist)
     low, high = fleet.action_low.tolist(), fleet.action_high.tolist()

@@ -131,7 +131,7 @@ class Engine:
         n = fleet.num_envs
         self.offers = Offers(n, run.humans, config.terms, self._log, self.wall)
         self.driver = Driver(
-            controls_of(config.task, fleet, config.assist and parts.expert is not None), fleet, parts.expert
+            controls_of(run.task, fleet.inner, config.assist and parts.expert is not None), fleet, parts.expert
         )
         self.people = People(self.offers, self.driver, self.lock, self.clock, config.lockstep, self.operators.used)
         self.reasons = Reasons(parse(run.priority, run.thresholds, run.gate), self.offers, run.queue == "fifo")

@@ -265,7 +265,7 @@ def _describe(engine: Engine) -> Description:
     names = getattr(fleet.inner, "names", None) or tuple(f"robot {k + 1}" for k in range(fleet.num_envs))
     cameras = getattr(getattr(fleet.inner, "description", None), "cameras", ("camera",))
     return Description(
-        config.task, tuple(names), tuple(cameras), config.hz, config.lockstep, run.humans, run.algorithm,
+        run.task or config.task, tuple(names), tuple(cameras), config.hz, config.lockstep, run.humans, run.algorithm,
         engine.driver.controls, run.t_reset, terms.fresh, terms.grace, terms.offer,
     )  # fmt: skip
 
