@@ -58,12 +58,14 @@ def test_nothing_without_a_session(stranger: httpx.Client, method: str, path: st
 
 
 def test_every_route_under_api_is_protected_or_meant_for_strangers(running: Running) -> None:
-    from tutelage.console import account_api, fleet_api
+    from tutelage.console import account_api, fleet_api, study_api, webrtc
 
-    routes = {(m, r.path) for router in (account_api.router, fleet_api.router) for r in router.routes for m in r.methods}  # type: ignore[attr-defined]
+    routers = (account_api.router, fleet_api.router, study_api.router, webrtc.router)
+    routes = {(m, r.path) for router in routers for r in router.routes for m in r.methods}  # type: ignore[attr-defined]
     open_to_all = {("POST", "/api/login"), ("POST", "/api/setup"), ("GET", "/healthz"), ("GET", "/metrics")}
     named = {(m, p.replace("/ana", "/{name}").replace("/1", "/{id}").replace("/0.jpg", "/{k}.jpg")) for m, p in PROTECTED}
-    assert routes - open_to_all == named
+    study = {("GET", "/api/study"), *(("POST", f"/api/study/{name}") for name in ("next", "turn", "answers"))}
+    assert routes - open_to_all == named | study | {("POST", "/api/webrtc")}  # these have tests of their own
 
 
 @pytest.mark.parametrize("path", SOCKETS)

@@ -285,3 +285,13 @@ def test_a_broken_record_is_told_with_its_row(tmp_path: Path) -> None:
     assert said.stderr == f"tutelage: {tmp_path}: row 1 was altered\n"
     assert tutelage("audit", "verify", tmp_path, "--noted", "xyz").returncode == 2
     assert "no record" in tutelage("audit", "verify", tmp_path / "nowhere").stderr
+
+
+def test_a_server_that_is_interrupted_while_it_prepares_ends_at_once(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", MAIN, "serve", "--fleet", "sim:Navigation", "--port", "0", "--out", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert process.stdout.readline()  # what is being prepared
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=30)[1] == "tutelage: interrupted\n"
+        assert process.returncode == 130

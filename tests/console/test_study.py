@@ -172,7 +172,9 @@ def test_the_study_is_for_operators(tmp_path: Path, sessions: list[Session]) -> 
     assert httpx.get(f"{session.running.origin}/api/study").status_code == 401
     with contextlib.closing(session.running.client("viewer")) as viewer:
         assert viewer.get("/api/study").status_code == 403
-        assert viewer.post("/api/study/next", json={}).status_code == 403
+        for name, body in (("next", {}), ("turn", {"card": 0}), ("answers", {"answers": {}})):
+            assert viewer.post(f"/api/study/{name}", json=body).status_code == 403
+            assert httpx.post(f"{session.running.origin}/api/study/{name}", json=body).status_code == 403
     with session.running.socket("ana") as ana:
         assert ana.hear("hello")["study"]["stage"] == "welcome"
         session.next()

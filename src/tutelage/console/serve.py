@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import ssl
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -151,7 +152,8 @@ def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, w
             raise ConfigError(f"make an account first: tutelage accounts add NAME --role admin --out {out}")
         listening = stack.enter_context(_listen(web.host, web.port))
         audit = stack.enter_context(contextlib.closing(Audit(out)))
-        opened = stack.enter_context(contextlib.closing(open_supervision(audit)))
+        with _ends_at_once():
+            opened = stack.enter_context(contextlib.closing(open_supervision(audit)))
         study = None if hasattr(opened, "start") else opened
         supervision = opened.supervision if hasattr(opened, "supervision") else opened
         app = create_app(Context(supervision, accounts, audit, site, host=web.host, study=study))
@@ -177,6 +179,17 @@ def _greet(say: Say, site: Site, listening: socket.socket, invitation: str | Non
         say(f"console: {address}")
         say("open it in a browser and log in; accounts: tutelage accounts --help")
     say("Ctrl-C ends it")
+
+
+@contextlib.contextmanager
+def _ends_at_once() -> Iterator[None]:
+    """Ctrl-C ends the process, as threads that are in the middle of training would abort an orderly end of the interpreter.
+    A folder that is half prepared is prepared anew."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("tutelage: interrupted", file=sys.stderr, flush=True)
+        os._exit(130)
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tutelage.console.audit import Audit
-from tutelage.console.parts import EngineConfig
+from tutelage.console.config import EngineConfig
 from tutelage.console.supervision import Supervision
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import RunConfig

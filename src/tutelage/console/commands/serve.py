@@ -53,7 +53,7 @@ def serve(
 
     web = WebConfig(host, port, certificate, key, origin)
     web.check()
-    from tutelage.console.parts import EngineConfig
+    from tutelage.console.config import EngineConfig
     from tutelage.console.supervision import Supervision
 
     engine = EngineConfig(
