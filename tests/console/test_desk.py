@@ -13,7 +13,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from tutelage.console.controls import Driver, controls_of
 from tutelage.console.offers import Offers, Terms
-from tutelage.console.people import Desk, People, Reasons, ended_by
+from tutelage.console.people import Desk, People, ended_by
+from tutelage.console.reasons import Reasons
 from tutelage.console.states import Denied, LeaseEnded, LeaseGranted
 from tutelage.console.stoppable import StoppableFleet
 from tutelage.fleet.loop import Loop

@@ -12,7 +12,7 @@ from fakes import make_view, wants
 from floor import LeaseEnded, LeaseGranted, Serving, Stepped, config
 
 from tutelage.console.offers import Offers
-from tutelage.console.people import Reasons
+from tutelage.console.reasons import Reasons
 from tutelage.console.states import Denied, Offer
 from tutelage.fleet.gates import GateConfig
 from tutelage.fleet.modes import Mode

@@ -15,7 +15,8 @@ from floor import LeaseEnded, Notice, Serving, config
 from tutelage.console.audit import samples_in
 from tutelage.console.packing import pack, unpack
 from tutelage.console.parts import learner_in, load_learner
-from tutelage.console.trainer import Training, load_weights, weights_of
+from tutelage.console.trainer import load_weights, weights_of
+from tutelage.console.training import Training
 from tutelage.learning.imitation import LearnerConfig
 
 SLOW = {"learner": LearnerConfig(every=10**6, batch=32)}

@@ -192,7 +192,7 @@ def controls_of(task: str, fleet: Fleet, assist: bool) -> Controls:
 
     Args:
         task: its name.
-        fleet: whose robots, not wrapped. One that is made by a function of somebody's says itself what its task is a kind of.
+        fleet: whose robots, not wrapped. One that a function of somebody's makes says itself what its task is a kind of.
         assist: whether there is an algorithmic human.
     """
     kinds = [getattr(kind, "name", "") for kind in type(getattr(fleet, "task", None)).__mro__]

@@ -12,8 +12,6 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,30 +19,30 @@ import numpy as np
 import torch
 
 from tutelage.console.audit import Audit
+from tutelage.console.config import EngineConfig
 from tutelage.console.controls import Driver, controls_of
 from tutelage.console.herald import Herald
 from tutelage.console.offers import Offers
 from tutelage.console.operators import Operators
-from tutelage.console.parts import EngineConfig, Parts, Report, make_parts
-from tutelage.console.people import Desk, People, Reasons, ended_by
-from tutelage.console.states import LeaseEnded, LeaseGranted, Metrics, Notice, Snapshot, Stepped
+from tutelage.console.pace import Pace
+from tutelage.console.parts import Parts, Report, make_parts
+from tutelage.console.people import Desk, People
+from tutelage.console.reasons import Reasons
+from tutelage.console.recording import Recording
+from tutelage.console.states import LeaseEnded, LeaseGranted, Notice, Stepped
 from tutelage.console.trainer import ProcessLearner
 from tutelage.errors import RunFolderError, TutelageError
 from tutelage.experiments.config import FORMAT
 from tutelage.experiments.recording import Recorder, lock
-from tutelage.fleet.loop import Loop
 from tutelage.fleet.policy import Learner
 from tutelage.fleet.priority import parse
-from tutelage.fleet.step import Step
-from tutelage.store import load_tree, save_tree, write_atomic
+from tutelage.store import load_tree, write_atomic
 
 if TYPE_CHECKING:
     from tutelage.remote.weights import SharedPolicy
 
 _LOG = logging.getLogger(__name__)
 FOREVER = 10**12
-SHOW = 0.5
-"""Seconds after which people see how things are while no timestep comes."""
 SWITCH = 0.0005
 """Seconds after which a thread that computes lets another one go on: the loop is to be on time while pictures are made."""
 
@@ -305,251 +303,3 @@ class Engine:
     @property
     def _stops(self) -> Path:
         return self.config.out / "stopped.json"
-
-
-class Recording:
-    """Subscriber: writes the step down, ends leases that it ended, and makes the snapshot."""
-
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
-        self.waits: deque[float] = deque(maxlen=200)
-        self.watchers: list[Callable[[Loop, Step], None]] = []
-        """Called in the loop's thread after each step, such as what copies states for pictures."""
-        self.losses: dict[str, float] = {}
-        self._unwritten: list[tuple[str, int, dict[str, Any], dict[str, Any]]] = []
-        self._metrics_at = self._saved_at = 0.0
-        self._slowest = self._latest = self._dearest = 0.0
-        self._saver = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
-        self._saving: Future[None] | None = None
-
-    def on_start(self, loop: Loop) -> None:
-        """Nothing to do."""
-
-    def on_step(self, loop: Loop, step: Step) -> None:
-        """Write, end, tell."""
-        engine = self._engine
-        engine.tick = time.perf_counter() - engine.pace.began
-        self._dearest = max(self._dearest, time.thread_time() - engine.pace.worked)
-        self._samples(step)
-        try:
-            engine.recorder.on_step(loop, step)
-        except TutelageError as error:
-            engine.trouble = str(error)
-        for watcher in self.watchers:
-            watcher(loop, step)
-        now = engine.clock()
-        with engine.lock:
-            engine.people.violation = loop.violation
-            self._ends(step, now)
-            engine.publish()
-            engine.show()
-        self._metrics(loop, now)
-        if now - self._saved_at >= engine.config.save_every and (self._saving is None or self._saving.done()):
-            self.save(loop)
-
-    def on_end(self, loop: Loop) -> None:
-        """Nothing to do: the engine saves when it closes."""
-
-    def look(self, loop: Loop) -> Snapshot:
-        """The fleet as it is. Call it with the lock."""
-        engine, offers = self._engine, self._engine.offers
-        n, now = loop.fleet.num_envs, engine.clock()
-        queue = offers.queue(now)
-        rank, reason = np.full(n, -1), [""] * n
-        for place, row in enumerate(queue):
-            rank[row["robot"]], reason[row["robot"]] = place, row["reason"]
-        held = np.zeros(n, dtype=bool)
-        leases = {}
-        for robot, hold in offers.holds.items():
-            held[robot] = engine.people.silent(robot)
-            reason[robot] = hold.lease.reason
-            lease = hold.lease
-            leases[robot] = {
-                "operator": lease.operator, "id": lease.id, "since": lease.since, "held": bool(held[robot]),
-                "reason": lease.reason,
-            }  # fmt: skip
-        for robot in np.flatnonzero(loop.violation).tolist():
-            reason[robot] = "violated"
-        stopped = engine.parts.fleet.latched
-        return Snapshot(
-            loop.t, engine.wall(now), loop.mode.copy(), loop.human_of, loop.age.copy(), tuple(reason), rank,
-            loop.online & ~stopped, stopped, held, tuple(queue), leases, engine.policy_version, engine.tick, engine.late,
-        )  # fmt: skip
-
-    def _samples(self, step: Step) -> None:
-        """What people did, into the durable record; what cannot be written now is tried again."""
-        people, version = self._engine.people, self._engine.policy_version
-        for robot in np.flatnonzero(step.taught).tolist():
-            lease = people.driving[robot]
-            arrays = {
-                "obs": step.obs[robot],
-                "proposed": step.proposed[robot],
-                "executed": step.actions[robot],
-                "wanted": step.wanted[robot],
-            }
-            fields = {"t": step.t, "lease": lease.id, "policy_version": version}
-            self._unwritten.append((lease.operator, robot, arrays, fields))
-        self.retry()
-
-    def retry(self) -> bool:
-        """Write what waits; whether all of it could be written."""
-        try:
-            while self._unwritten:
-                who, robot, arrays, fields = self._unwritten[0]
-                self._engine.audit.sample(who, robot, arrays, **fields)
-                self._unwritten.pop(0)
-        except TutelageError as error:
-            self._engine.trouble = str(error)
-            return False
-        return True
-
-    def _ends(self, step: Step, now: float) -> None:
-        offers = self._engine.offers
-        for robot, why in ended_by(step.events):
-            if why == "reset_done" and robot in offers.holds:
-                self._engine.operators[offers.holds[robot].lease.operator].resets += 1
-            if robot in offers.holds or why == "reset_done":
-                offers.end(robot, why, now)
-
-    def _metrics(self, loop: Loop, now: float) -> None:
-        engine = self._engine
-        self._slowest, self._latest = max(self._slowest, engine.tick), max(self._latest, engine.late)
-        if now - self._metrics_at < 1.0:
-            return
-        row = engine.recorder.row()
-        steps = max(1, loop.fleet.num_envs * loop.t)
-        row |= {
-            "time": time.time(),
-            "human_steps": row["teleoperation"],
-            "intervention_rate": row["teleoperation"] / steps,
-            "queue": len(engine.offers.order),
-            "queue_wait": float(np.mean(self.waits)) if self.waits else 0.0,
-            "policy_version": engine.policy_version,
-            "tick_ms": 1000 * self._slowest,
-            "tick_cpu_ms": 1000 * self._dearest,
-            "late_ms": 1000 * self._latest,
-        }
-        self._metrics_at, self._slowest, self._latest, self._dearest = now, 0.0, 0.0, 0.0
-        engine.rows.append(row)
-        engine.herald.tell(Metrics(None, row))
-
-    def save(self, loop: Loop, wait: bool = False) -> None:
-        """Keep the state of the loop; the disk is waited for in another thread."""
-        engine = self._engine
-        tree = {
-            "format": FORMAT,
-            "t": loop.t,
-            "loop": loop.state_dict() if loop.fleet.can_checkpoint else {},
-            "recorder": engine.recorder.state_dict(),
-            "operators": engine.operators.state_dict(),
-        }
-        try:
-            engine.recorder.commit(loop.t)
-        except TutelageError as error:
-            engine.trouble = str(error)
-        self._saved_at = engine.clock()
-        self._saving = self._saver.submit(self._write, tree)
-        if wait:
-            self._saving.result()
-
-    def _write(self, tree: dict[str, Any]) -> None:
-        try:
-            save_tree(self._engine.checkpoint, tree)
-        except TutelageError as error:
-            self._engine.trouble = str(error)
-
-    def later(self, work: Callable[[], None]) -> None:
-        """Do something in the thread that waits for the disk."""
-        self._saver.submit(work)
-
-    def close(self) -> None:
-        """Wait for the disk."""
-        self._saver.shutdown()
-
-
-class Pace:
-    """The last subscriber: waits until the next timestep is to begin."""
-
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
-        self.began, self.worked = time.perf_counter(), 0.0
-        """When the timestep began, and the CPU time of the loop's thread then, s."""
-        self._due = 0.0
-
-    def on_start(self, loop: Loop) -> None:
-        """The first timestep begins now."""
-        self._due = self._engine.clock()
-        self._ready()
-
-    def on_step(self, loop: Loop, step: Step) -> None:
-        """Wait for the clock; for the disk, if it is full; in lock-step for people, as long as they are given."""
-        engine = self._engine
-        period = 1.0 / engine.config.hz
-        self._due += period
-        if not engine.parts.fleet.paces:
-            self._wait_until(self._due)
-        while (reason := engine.trouble or engine.audit.error) is not None and not engine.closing:
-            self._hold(reason)
-        if engine.config.lockstep:
-            self._wait_for_people()
-        if engine.parts.fleet.paces:
-            self._due = engine.clock()
-        engine.late = max(engine.clock() - self._due, float(getattr(engine.parts.fleet.inner, "late", 0.0)))
-        if engine.late > period:  # no hurrying after a stall: that would be a robot in fast motion
-            self._due = engine.clock()
-            if engine.config.lockstep:
-                engine.late = 0.0
-        self._ready()
-
-    def on_end(self, loop: Loop) -> None:
-        """Nothing to do."""
-
-    def _ready(self) -> None:
-        self.began, self.worked = time.perf_counter(), time.thread_time()
-
-    def _wait_until(self, due: float) -> None:
-        engine = self._engine
-        with engine.lock:
-            while not engine.closing and (left := due - engine.clock()) > 0:
-                engine.lock.wait(left)
-                if engine.publish():
-                    engine.show()
-
-    def _wait_for_people(self) -> None:
-        engine = self._engine
-        shown = engine.clock()
-        deadline = shown + engine.config.deadline
-        with engine.lock:
-            while not engine.closing and engine.clock() < deadline and engine.people.waiting_for():
-                engine.lock.wait(0.1)
-                engine.offers.tick(engine.clock())
-                if engine.publish() or engine.clock() - shown > SHOW:
-                    engine.show()
-                    shown = engine.clock()
-
-    def _hold(self, reason: str) -> None:
-        """Nobody moves while nothing can be written down."""
-        engine = self._engine
-        engine.trouble, engine.people.frozen = reason, True
-        engine.herald.tell(Notice(None, "error", f"robots are held, because nothing can be recorded: {reason}"))
-        while not engine.closing:
-            with engine.lock:
-                engine.lock.wait(0.25)
-                engine.offers.tick(engine.clock())
-                engine.publish()
-                engine.show()
-            if engine.audit.error is None and self._writable():
-                break
-        engine.trouble, engine.people.frozen = None, False
-        self._due = engine.clock()
-        engine.herald.tell(Notice(None, "info", "recording works again, robots go on"))
-
-    def _writable(self) -> bool:
-        engine = self._engine
-        try:
-            engine.recorder.commit(engine.loop.t)
-            write_atomic(engine.config.out / ".probe", b"0" * 65536)
-            (engine.config.out / ".probe").unlink()
-        except (TutelageError, OSError):
-            return False
-        return engine.recording.retry()

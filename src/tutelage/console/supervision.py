@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from tutelage.console.audit import Audit
+from tutelage.console.config import EngineConfig
 from tutelage.console.engine import Engine
 from tutelage.console.frames import Frames
-from tutelage.console.parts import EngineConfig, Report
+from tutelage.console.parts import Report
 from tutelage.console.replay import Replay
 from tutelage.console.states import (
     Denied,
