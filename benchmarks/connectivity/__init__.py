@@ -117,7 +117,7 @@ class Pair:
 @contextmanager
 def pairs(stacks: tuple[str, ...]) -> Iterator[dict[str, Pair]]:
     """All stacks, with the routers that they need."""
-    with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         setup = stack.enter_context(prepare(Path(folder)))
         made: dict[str, Pair] = {}
         for name in stacks:

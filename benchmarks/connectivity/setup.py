@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.connectivity.stacks import FAR, NEAR
+from tutelage.sgc import lanes
 from tutelage.sgc.local import LocalFleet
 from tutelage.sgc.transport.config import Endpoint, NetworkConfig
 
@@ -68,11 +69,13 @@ def prepare(folder: Path) -> Iterator[dict[str, Any]]:
     for name in (NEAR, FAR):
         NetworkConfig((Endpoint("tls", "127.0.0.1", tls),)).save(homes[name].path)
     topics = homes[NEAR].access.topics
-    names = {each: {way: topics[f"{each}-{way}"].name.hex() for way in ("there", "back")} for each in PLAIN}
+    keys = {
+        each: {way: lanes.key(topics[f"{each}-{way}"].name, lanes.STREAM) for way in ("there", "back")} for each in PLAIN
+    }
     ports = {"sockets": sockets, "rosbridge": rosbridge, "zenoh tcp": tcp, "zenoh mtls": tls, "zenoh quic": quic}
     setup = {
         "homes": {name: str(home.path) for name, home in homes.items()},
-        "names": names,
+        "keys": keys,
         "ports": ports,
     }
     with ExitStack() as stack:

@@ -173,10 +173,10 @@ class Zenoh(Link):
         identity = None if protocol == "tcp" else Identity(home / "root.pem", home / "leaf.pem", home / "signing.key")
         where = Endpoint(protocol, "127.0.0.1", setup["ports"][stack])
         self._transport = ZenohTransport(NetworkConfig((where,)), identity)
-        names = setup["names"][protocol]
+        keys = setup["keys"][protocol]
         out, back = ("there", "back") if side == NEAR else ("back", "there")
-        self._out, back = f"{names[out]}/stream", f"{names[back]}/stream"
-        self._transport.subscribe(back, on_bytes)
+        self._out = keys[out]
+        self._transport.subscribe(keys[back], on_bytes)
 
     def send(self, payload: bytes) -> None:
         self._transport.publish(self._out, payload)

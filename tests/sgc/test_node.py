@@ -12,6 +12,7 @@ import pytest
 from sgc.fleets import Fleet, eventually, service, topic
 
 from tutelage.errors import ConfigError
+from tutelage.sgc import lanes
 from tutelage.sgc import publisher as publishing
 from tutelage.sgc.errors import NotAllowed, NotIssued
 from tutelage.sgc.messages import Message
@@ -306,7 +307,8 @@ def test_a_reply_to_another_request_is_refused(network: Network, arm: Node, serv
     with server.serve("grasp", lambda asked: asked.payload):
         arm.request("grasp", b"to get acquainted")
         replies: list[bytes] = []
-        network.answer_tap = lambda key, reply: replies.append(reply) or replies[0]
+        calls = lanes.key(arm.access.entry("grasp").name, lanes.CALL)
+        network.answer_tap = lambda key, reply: reply if key != calls else replies.append(reply) or replies[0]
         assert arm.request("grasp", b"0") == b"0"
         with pytest.raises(NoReply, match="refused"):
             arm.request("grasp", b"1")
@@ -326,7 +328,7 @@ def test_peers_are_known_by_name_and_can_be_pinged(arm: Node, server: Node) -> N
 
 def test_an_invented_presence_is_no_peer(network: Network, arm: Node) -> None:
     name = arm.access.entry("camera").name
-    with MemoryTransport(network).announce(f"{name.hex()}/here/{'ab' * 16}"):
+    with MemoryTransport(network).announce(lanes.key(name, lanes.HERE, "ab" * 16)):
         assert arm.peers(timeout=0.2) == []
 
 

@@ -66,7 +66,7 @@ def access_control(
     rules, subjects, policies = [], [], []
     for who in sorted(set(grants) - denied):
         allowed = grants[who]
-        own = [f"*/{lanes.HERE}/{who}"], [f"*/{lanes.ECHO}/{who}"]  # under a name that only members know
+        own = [f"*/*/*/{lanes.HERE}/{who}"], [f"*/*/*/{lanes.ECHO}/{who}"]  # under a name that only members know
         for grant, keys in zip((ANNOUNCE, SERVE), own, strict=True):
             for flow, message in grant:
                 allowed[flow, message] += keys
