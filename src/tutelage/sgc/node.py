@@ -144,6 +144,7 @@ class Node:
         *,
         queue: int | None = None,
         provisional: bool = False,
+        direct: bool = False,
     ) -> Subscription:
         """Receive a topic's messages.
 
@@ -151,13 +152,15 @@ class Node:
         queue: messages that may wait for the application; default: 64 on a reliable topic, 1 on a lossy one. Beyond: on a
             reliable topic, the rest is fetched again from the publisher when there is room; on a lossy one the newest win.
         provisional: chain mode: deliver at once, with `Message.authentic` False, what the chain confirms 20 ms later.
+        direct: call `on_message` on the network's own thread, which saves a change of threads; it must return at once, as
+            everything else that this node receives waits for it. For control loops.
 
         Raises:
             NotAllowed: the policy does not let this node subscribe there.
         """
         entry = self._entry(alias, Kind.STREAM)
         opener = Opener(self.keyring, alias, provisional=provisional)
-        subscription = Subscription(alias, entry, opener, self.transport, self._wake.set, self._pool, on_message, queue)
+        subscription = Subscription(alias, entry, opener, self.transport, self._wake.set, self._pool, on_message, queue, direct)
         with self._lock:
             self._subscriptions = [each for each in self._subscriptions if not each.closed] + [subscription]
         return subscription

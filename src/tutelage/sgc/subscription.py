@@ -82,6 +82,7 @@ class Subscription:
         pool: Workers,
         on_message: Callable[[Message], None] | None,
         queue: int | None,
+        direct: bool = False,
     ) -> None:
         """
         Args:
@@ -89,8 +90,10 @@ class Subscription:
             opener: a new one; nobody else may use it.
             need_key: called when a packet is sealed under a key that we do not have.
             pool: where questions to publishers wait for their answers.
-            on_message, queue: see `Node.subscribe`.
+            on_message, queue, direct: see `Node.subscribe`.
         """
+        if direct and on_message is None:
+            raise ConfigError(f"a direct subscription of {alias} needs a callback")
         if queue is not None and queue < 1:
             raise ConfigError(f"a queue holds at least one message, not {queue}")
         self.alias = alias
@@ -127,6 +130,8 @@ class Subscription:
         self._offer_at = float("inf")
         self._out: queues.Queue[Message | None] = queues.Queue(self._limit)
         self._closed = threading.Event()
+        self._direct = direct
+        self._turn = threading.Lock()  # whose turn it is to deal with packets, if direct: the network's thread or our own
         self._session = rule.authenticity == Authenticity.SESSION
         self._handles = [transport.subscribe(lanes.key(entry.name, lanes.STREAM), self._on_packet)]
         if self._session:
@@ -203,6 +208,12 @@ class Subscription:
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
     def _on_packet(self, packet: bytes) -> None:
+        if self._direct and self._inbox.empty() and self._turn.acquire(blocking=False):
+            try:
+                self._at_once(packet)
+            finally:
+                self._turn.release()
+            return
         with self._lock:
             full = self._inbox.qsize() >= self._inbox_limit or self._inbox_bytes + len(packet) > INBOX_BYTES
             if full and not self._lossy:
@@ -212,6 +223,17 @@ class Subscription:
         if full:
             self._drop_oldest()
         self._inbox.put((time.time(), packet))
+
+    def _at_once(self, packet: bytes) -> None:
+        """Deal with a packet on the network's thread; what takes time or has to wait is left to our own."""
+        if self._closed.is_set():
+            return
+        try:
+            self._pass_on(self._take(time.time(), packet))
+        except Exception:
+            log.exception("subscription of %s", self.alias)
+        if self.delivery.wake() is not None:
+            self._inbox.put(_Retry())  # wakes our thread, which then sees to the gap
 
     def _drop_oldest(self) -> None:
         try:
@@ -236,19 +258,19 @@ class Subscription:
             self._offer()
         while not self._closed.is_set():
             wake = self._wake()
-            try:
+            item: tuple[float, bytes] | _Repair | _Answer | _Retry | None = None
+            with contextlib.suppress(queues.Empty):
                 item = self._inbox.get(timeout=None if wake is None else max(0.0, wake - time.monotonic()))
-            except queues.Empty:
-                pass
-            else:
                 if item is None:
                     return
+            with self._turn:
                 try:
-                    self._deal_with(item)
+                    if item is not None:
+                        self._deal_with(item)
+                    if wake is not None or self._wake() is not None:
+                        self._mend()
                 except Exception:
                     log.exception("subscription of %s", self.alias)
-            if wake is not None or self._wake() is not None:
-                self._mend()
 
     def _wake(self) -> float | None:
         wake = self.delivery.wake()
