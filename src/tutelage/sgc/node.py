@@ -160,7 +160,9 @@ class Node:
         """
         entry = self._entry(alias, Kind.STREAM)
         opener = Opener(self.keyring, alias, provisional=provisional)
-        subscription = Subscription(alias, entry, opener, self.transport, self._wake.set, self._pool, on_message, queue, direct)
+        subscription = Subscription(
+            alias, entry, opener, self.transport, self._wake.set, self._pool, on_message, queue, direct
+        )
         with self._lock:
             self._subscriptions = [each for each in self._subscriptions if not each.closed] + [subscription]
         return subscription

@@ -199,7 +199,7 @@ def serve(authority: Positional[Path], home: Positional[Path], hours: float = 24
     fleet, node_home = _authority(authority), _home(home)
     from tutelage.sgc import lanes
     from tutelage.sgc.node import Node
-    from tutelage.sgc.renewal import Office
+    from tutelage.sgc.office import Office
 
     renewals = node_home.access.renewals
     if renewals is None or renewals.pseudonym != node_home.pseudonym:
