@@ -62,6 +62,7 @@ def access_control(
         _of_route(grants, route)
     for who in members:
         _allow(grants, {who}, (*PUBLISH, *SUBSCRIBE), lanes.key(control, lanes.DENY))
+        _allow(grants, {who}, ASK, lanes.key(control, lanes.RULES))  # the router itself answers
         _allow(grants, {who}, SERVE if who == office else ASK, lanes.key(control, lanes.RENEW))
     rules, subjects, policies = [], [], []
     for who in sorted(set(grants) - denied):

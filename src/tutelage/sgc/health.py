@@ -78,10 +78,9 @@ def node_health(node: Node) -> Tree:
         problems.append("not connected to a router")
     if left < EXPIRES_SOON:
         problems.append(f"the certificate ends in {left:.0f} s" if left > 0 else "the certificate has expired")
-    wanted = node.keyring.wanted()
-    missing = [alias for alias in wanted if node.keyring.epoch(alias) is None]
-    if missing:
+    if missing := node.lacking():
         problems.append(f"no key yet of: {', '.join(missing)}")
+    problems += node.diagnosis.problems()
     return {"ok": not problems, "node": node.name, "problems": problems, "certificate_expires_in": left}
 
 

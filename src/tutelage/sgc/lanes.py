@@ -15,6 +15,7 @@ CALL = "call"  # requests to a service
 HERE = "here"  # presence, with the pseudonym
 ECHO = "echo"  # pings, with the pseudonym
 DENY = "deny"  # on the fleet's control channel: the deny list
+RULES = "rules"  # on the fleet's control channel: which of its topics a router knows a node to have a part in
 RENEW = "renew"  # on the fleet's control channel: certificates to renew, changes of the policy
 
 

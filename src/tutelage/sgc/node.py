@@ -22,6 +22,7 @@ from typing import Any, Self
 from tutelage.errors import TutelageError
 from tutelage.sgc import health, lanes
 from tutelage.sgc.access import Access, Entry, Kind, Lane
+from tutelage.sgc.diagnosis import Diagnosis
 from tutelage.sgc.errors import NotAllowed
 from tutelage.sgc.home import Home
 from tutelage.sgc.key_exchange import KeyExchange
@@ -73,6 +74,7 @@ class Node:
         self._joined: dict[str, tuple[Entry, list[Handle]]] = {}
         self._keys = KeyExchange(self.keyring, transport, self._pool, self.refusals, self._wake.set, self._key_came)
         self.presence = Presence(self.keyring, home.pseudonym, transport, self._wake.set, self._pool)
+        self.diagnosis = Diagnosis(home, transport, self._pool, self.lacking)
         self._deny_key = lanes.key(self.access.control, lanes.DENY)
         self._handles.append(transport.subscribe(self._deny_key, self._on_deny))
         self._follow_policy()
@@ -122,6 +124,10 @@ class Node:
     def connected(self) -> bool:
         """Is there a connection to a router?"""
         return self.transport.connected
+
+    def lacking(self) -> list[str]:
+        """Aliases of topics whose keys have not come yet."""
+        return [alias for alias in self.keyring.wanted() if self.keyring.epoch(alias) is None]
 
     def publisher(self, alias: str) -> Publisher:
         """The publisher of a topic; the same one each time, until it is closed.
@@ -316,6 +322,7 @@ class Node:
                     self._follow_files()
                     self._keys.hand_out()
                     self._gossip()
+                    self.diagnosis.look()
             except TutelageError as error:
                 log.warning("%s: %s", self.name, error)
                 pause = TEND

@@ -53,7 +53,12 @@ class Transport(ABC):
     """Publish, subscribe, request, reply and presence over keys. Safe to use from several threads.
 
     Callbacks run on the transport's threads. They must return at once and must not raise; `on_request` may take its time.
+
+    Attributes:
+        routed: do packets pass routers, which have rules of their own?
     """
+
+    routed = True
 
     @property
     @abstractmethod
