@@ -1,7 +1,7 @@
 """`python -m benchmarks.connectivity.hub HOST PORT`: a server of rosbridge's protocol between its clients.
 
-As rosbridge_server, it reads each message, makes a value of it (base64 to bytes), and writes it anew for every subscriber. It
-leaves out what ROS does in between, so it is faster than the real one.
+As rosbridge_server, it reads each message, makes a value of it (base64 to bytes), and writes it anew for every subscriber.
+It leaves out what ROS does in between, so it is faster than the real one.
 """
 
 from __future__ import annotations

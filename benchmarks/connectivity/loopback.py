@@ -1,7 +1,7 @@
 """Round trips at four sizes and floods of 1000-byte messages on loopback.
 
-All stacks are up at the same time and take turns, round after round, so a busy machine loads all of them alike; what counts are
-ratios.
+All stacks are up at the same time and take turns, round after round, so a busy machine loads all of them alike; what counts
+are ratios.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ TRIPS = {"64 B": 100, "8 KB": 60, "256 KB": 20, "14 MB": 3}
 
 
 def measure(quick: bool = False, stacks: tuple[str, ...] = STACKS) -> dict[str, Any]:
-    """Medians, and medians over rounds of ratios: to Zenoh with mutual TLS (round trips), to Cyclone and rosbridge (rates)."""
+    """Medians; and medians of ratios, to Zenoh with mutual TLS (round trips), to Cyclone and rosbridge (rates)."""
     rounds, flood = (2, 0.5) if quick else (9, 1.5)
     middle: dict[str, dict[str, list[float]]] = {name: {size: [] for size in SIZES} for name in stacks}
     rates: dict[str, list[float]] = {name: [] for name in stacks}

@@ -1,11 +1,12 @@
 """`python -m benchmarks.connectivity.relay ONE OTHER DELAY LOSS`: a wide-area network between two network namespaces.
 
-A network device of layer 3 in each (TUN); a packet that goes into one comes out of the other DELAY seconds later, or never, with
-probability LOSS. So TCP, QUIC and everything else lose and repeat real packets. Needs root.
+A network device of layer 3 in each (TUN); a packet that goes into one comes out of the other DELAY seconds later, or never,
+with probability LOSS. So TCP, QUIC and everything else lose and repeat real packets. Needs root.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import fcntl
 import os
@@ -46,10 +47,8 @@ def carry(one: int, other: int, delay: float, loss: float) -> None:
         now = time.monotonic()
         for out, waiting in ways.values():
             while waiting and waiting[0][0] <= now:
-                try:
+                with contextlib.suppress(OSError):  # the other side takes nothing: lost, as in any network
                     os.write(out, waiting.popleft()[1])
-                except OSError:
-                    pass  # the other side takes nothing: lost, as in any network
         due = min((waiting[0][0] for _, waiting in ways.values() if waiting), default=now + 1.0)
         readable, _, _ = select.select(list(ways), [], [], max(0.0, due - time.monotonic()))
         for tun in readable:

@@ -1,4 +1,4 @@
-"""From starting a program to its first message, while a publisher sends every 2 ms: with and without keys from an earlier start."""
+"""From starting a program to its first message, while a publisher sends every 2 ms; also with keys from an earlier start."""
 
 from __future__ import annotations
 

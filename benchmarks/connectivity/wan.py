@@ -1,5 +1,5 @@
-"""Round trips over an emulated wide-area network, 40 ms and 1 % loss each way, as the dissertation's figure 8.7 has them over
-a real one: a message goes to the cloud, which answers with 32 bytes. Routers and servers are in the cloud.
+"""Round trips over an emulated wide-area network, 40 ms and 1 % loss each way, as the dissertation's figure 8.7 has them
+over a real one: a message goes to the cloud, which answers with 32 bytes. Routers and servers are in the cloud.
 
 `python -m benchmarks.connectivity.wan SETUP ROUNDS` is the robot's side, which runs in a network namespace of its own.
 """
@@ -44,7 +44,9 @@ def measure(quick: bool = False) -> dict[str, Any]:
         relay = [sys.executable, "-m", "benchmarks.connectivity.relay", robot, cloud, str(DELAY), str(LOSS)]
         running = subprocess.Popen(relay, stdout=subprocess.PIPE)
         try:
-            assert running.stdout and running.stdout.readline()
+            assert running.stdout
+            if not running.stdout.readline():
+                raise RuntimeError("the relay did not come up")
             with prepare(Path(folder), ADDRESSES[1], [*inside, cloud]) as setup:
                 command = [sys.executable, "-m", "benchmarks.connectivity.wan", json.dumps(setup), "1" if quick else "5"]
                 done = subprocess.run([*inside, robot, *command], stdout=subprocess.PIPE, check=True, timeout=600)

@@ -1,8 +1,8 @@
-"""Why a node hears nothing: no router, a router that does not know it, an owner that does not answer. Said once, with the remedy.
+"""Why a node hears nothing: no router, one that does not know it, an owner that is silent. Said once, with the remedy.
 
-A router lets pass only what its copy of the policy allows, and drops the rest in silence. So nodes ask it which of their topics
-it knows: they send their pseudonym and names, which it sees anyway, and get a byte for each. The answer is not trusted and
-changes nothing but what is logged and what `/healthz` says.
+A router lets pass only what its copy of the policy allows, and drops the rest in silence. So nodes ask it which of their
+topics it knows: they send their pseudonym and names, which it sees anyway, and get a byte for each. The answer is not
+trusted and changes nothing but what is logged and what `/healthz` says.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where nodes and routers have their certificates renewed: beside the authority's folder, by the node that the policy names."""
+"""Where nodes and routers get their certificates renewed: beside the authority's folder, by a node that the policy names."""
 
 from __future__ import annotations
 
