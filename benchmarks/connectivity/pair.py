@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.connectivity.setup import prepare
-from benchmarks.connectivity.stacks import NEAR, Cyclone, Link, open_link
+from benchmarks.connectivity.stacks import NEAR, Cyclone, Link, alias, open_link
 
 TIMEOUT = 30.0
 HELLO = b"are you there?"
@@ -85,7 +85,8 @@ class Pair:
             time.sleep(0.05)
         self._tell("echo")
         if report["count"] != sent or report["wrong"]:
-            raise ValueError(f"{self.stack}: {sent} sent, {report['count']} came, {report['wrong']} of them wrong")
+            told = json.dumps(report["counters"].get("topics", {}).get(f"{alias(self.stack)}-there", {}))
+            raise ValueError(f"{self.stack}: {sent} sent, {report['count']} came, {report['wrong']} of them wrong; {told}")
         return float(sent / report["seconds"])
 
     def close(self) -> None:

@@ -15,6 +15,7 @@ from tutelage.errors import ConfigError
 from tutelage.sgc import lanes
 from tutelage.sgc import publisher as publishing
 from tutelage.sgc.errors import NotAllowed, NotIssued
+from tutelage.sgc.history import make_request
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
 from tutelage.sgc.service import RequestFailed
@@ -162,6 +163,25 @@ def test_the_last_message_is_not_missed_either(network: Network, arm: Node, serv
     log.send(b"0")
     network.up = True
     eventually(lambda: in_order(got, 1))
+
+
+def test_a_subscriber_that_is_about_to_miss_something_is_waited_for(arm: Node) -> None:
+    log = arm.publisher("log-signature")
+    log._history._limit = 100
+    for k in range(100):
+        log.send(b"%d" % k)
+        log.flush(1.0)  # a packet each
+    log._free_at = 0.0
+    log._replay(make_request([(90, 90)]))
+    assert log._free_at == 0.0
+    now = time.monotonic()
+    log._replay(make_request([(10, 20)]))
+    assert log._free_at > now
+    log.send(b"waits in the queue")
+    eventually(lambda: log.queued == 0)
+    waited = log._free_at
+    log._replay(make_request([(10, 20)]))  # nothing came of it: whoever is stuck is not waited for again
+    assert log._free_at <= max(waited, time.monotonic() + log._spacing)
 
 
 def test_a_publisher_that_is_gone_leaves_a_counted_gap(fleet: Fleet, network: Network, server: Node) -> None:

@@ -37,6 +37,7 @@ VERSION = 1
 MODES = {Authenticity.SIGNATURE: 1, Authenticity.SESSION: 2, Authenticity.CHAIN: 3}
 _HEADER = struct.Struct(">BBHHHI16s16sQQ")
 HEADER = _HEADER.size
+_FLAGS = 3
 STREAM, SENDER, IDENT = slice(8, 44), slice(12, 28), slice(12, 52)
 """Parts of a header: epoch, sender and salt; sender; sender, salt and sequence."""
 MAX_PACKET = HEADER + MAX_PAYLOAD + 4 * (MAX_BATCH + 1) + TAG + 2 * MAX_PART
@@ -96,6 +97,11 @@ def read_header(packet: memoryview, mode: int) -> Header:
 def ident(packet: Buffer) -> bytes:
     """40 bytes that identify a packet: sender, salt and sequence. A reply binds to that of its request."""
     return bytes(memoryview(packet)[IDENT])
+
+
+def anchored(packet: Buffer) -> bool:
+    """Does a packet of a chain carry an anchor?"""
+    return bool(packet[_FLAGS] & ANCHOR)
 
 
 def nonce(purpose: int, header: bytes) -> bytes:

@@ -18,7 +18,8 @@ from tutelage.errors import ConfigError, TutelageError
 from tutelage.sgc import frames, lanes
 from tutelage.sgc.access import Authenticity, Delivery, Entry
 from tutelage.sgc.errors import NoKey
-from tutelage.sgc.history import History
+from tutelage.sgc.history import History, parse_request
+from tutelage.sgc.packet import anchored
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.sealing import Sealer
 from tutelage.sgc.transport.base import Congested, Transport
@@ -37,6 +38,9 @@ SPACING = {Authenticity.SIGNATURE: 0.0004, Authenticity.SESSION: 0.0002, Authent
 
 FIRST_LIFE, LAST_LIFE = 0.05, 5.0
 """Seconds of silence after which a reliable stream shows what it has sent so far; the pause doubles up to the second."""
+
+WAIT_FOR_THE_SLOW = 0.1
+"""Seconds for which a question of a subscriber that is far behind, and catching up, holds up what comes next."""
 
 GREETINGS = 0.1
 """Seconds between two introductions that strangers may ask for."""
@@ -71,6 +75,7 @@ class Publisher:
         self._queue: deque[tuple[bytes, int]] = deque()  # with the time at which it was sent, nanoseconds since 1970
         self._queued = 0
         self._offers: deque[bytes] = deque(maxlen=64)
+        self._asked: deque[int] = deque(maxlen=64)  # first sequence numbers for which we waited
         self._busy = False
         self._closing = False
         self._failure: TutelageError | None = None
@@ -254,7 +259,7 @@ class Publisher:
     def _hand_over(self, first: int, packet: bytes | bytearray) -> None:
         if not self._lossy:
             last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
-            self._history.add(min(first, last), last, packet, time.monotonic())
+            self._history.add(min(first, last), last, packet, time.monotonic(), confirms=self._chain and anchored(packet))
         self.packets += 1
         self._transport.publish(self._key, packet, reliable=not self._lossy)
 
@@ -358,8 +363,15 @@ class Publisher:
             self._life_at = time.monotonic()
 
     def _replay(self, request: bytes) -> bytes | None:
+        """Somebody missed something. Whoever is so far behind that it will soon be gone is waited for, while it catches up;
+        one that is stuck asks for the same again and again, and holds up nobody."""
         try:
             answer = self._history.answer(request)
+            first = parse_request(request)[0][0]
+            if first not in self._asked and self._history.nearly_gone(first):
+                self._asked.append(first)
+                with self._changed:
+                    self._free_at = max(self._free_at, time.monotonic() + WAIT_FOR_THE_SLOW)
         except Refused as refused:
             self.refusals.add(refused.reason)
             return None

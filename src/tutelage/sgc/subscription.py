@@ -29,7 +29,9 @@ from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
 
-INBOX_BYTES = 64 << 20
+INBOX_BYTES = 16 << 20
+"""Much less than what a publisher keeps: what is left unopened is missed only when all before it has been opened."""
+
 HELD_PACKETS = 256
 """Packets that wait until we know their sender or have the key for them."""
 
@@ -119,7 +121,8 @@ class Subscription:
             else delivery.InOrder(started, patience, from_first_heard=rule.authenticity == Authenticity.SESSION)
         )
         self._assemblies: dict[bytes, frames.Assembly] = {}
-        self._inbox: queues.SimpleQueue[tuple[float, bytes] | _Repair | _Answer | _Retry | None] = queues.SimpleQueue()
+        self._inbox: queues.SimpleQueue[tuple[float, bytes] | _Answer | _Retry | None] = queues.SimpleQueue()
+        self._repairs: deque[_Repair] = deque()  # before the inbox: what it holds waits for them
         self._inbox_limit = max(self._limit, 64)
         self._inbox_bytes = 0
         self._lock = threading.Lock()
@@ -208,14 +211,16 @@ class Subscription:
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
     def _on_packet(self, packet: bytes) -> None:
-        if self._direct and self._inbox.empty() and self._turn.acquire(blocking=False):
+        idle = self._direct and self._inbox.empty() and not self.delivery.crowded
+        if idle and self._turn.acquire(blocking=False):
             try:
                 self._at_once(packet)
             finally:
                 self._turn.release()
             return
         with self._lock:
-            full = self._inbox.qsize() >= self._inbox_limit or self._inbox_bytes + len(packet) > INBOX_BYTES
+            waiting, size = self._inbox.qsize(), self._inbox_bytes + len(packet)
+            full = waiting >= self._inbox_limit or size > INBOX_BYTES or self.delivery.crowded
             if full and not self._lossy:
                 self.deferred += 1  # not opened, so not marked as seen: it can be fetched again
                 return
@@ -258,13 +263,15 @@ class Subscription:
             self._offer()
         while not self._closed.is_set():
             wake = self._wake()
-            item: tuple[float, bytes] | _Repair | _Answer | _Retry | None = None
+            item: tuple[float, bytes] | _Answer | _Retry | None = None
             with contextlib.suppress(queues.Empty):
                 item = self._inbox.get(timeout=None if wake is None else max(0.0, wake - time.monotonic()))
                 if item is None:
                     return
             with self._turn:
                 try:
+                    while self._repairs:
+                        self._repair(self._repairs.popleft())
                     if item is not None:
                         self._deal_with(item)
                     if wake is not None or self._wake() is not None:
@@ -276,7 +283,18 @@ class Subscription:
         wake = self.delivery.wake()
         return wake if not self._session else self._offer_at if wake is None else min(wake, self._offer_at)
 
-    def _deal_with(self, item: tuple[float, bytes] | _Repair | _Answer | _Retry) -> None:
+    def _repair(self, repair: _Repair) -> None:
+        """What a publisher sent when it was asked."""
+        received, refused = time.time(), 0
+        for late in repair.packets:
+            before = self.packets
+            self._pass_on(self._take(received, late))
+            self.repaired += self.packets > before
+            refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
+        ready = self.delivery.answered(repair.salt, repair.floor, time.monotonic(), in_vain=refused > 0)
+        self._pass_on(self._messages(ready, received))
+
+    def _deal_with(self, item: tuple[float, bytes] | _Answer | _Retry) -> None:
         if isinstance(item, tuple):
             with self._lock:
                 self._inbox_bytes -= len(item[1])
@@ -284,15 +302,6 @@ class Subscription:
                 self._pass_on_newest(self._take(*item))
             else:
                 self._pass_on(self._take(*item))
-        elif isinstance(item, _Repair):
-            received, refused = time.time(), 0
-            for late in item.packets:
-                before = self.packets
-                self._pass_on(self._take(received, late))
-                self.repaired += self.packets > before
-                refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
-            ready = self.delivery.answered(item.salt, item.floor, time.monotonic(), in_vain=refused > 0)
-            self._pass_on(self._messages(ready, received))
         elif isinstance(item, _Answer):
             try:
                 self.opener.complete_session(item.packet)
@@ -399,7 +408,8 @@ class Subscription:
             self._timeouts = {salt: min(2 * timeout, ANSWER_TIMEOUT[1])}  # of the stream in trouble; others begin anew
         except Refused as refused:
             self.opener.refusals.add(refused.reason)
-        self._inbox.put(repair)
+        self._repairs.append(repair)
+        self._inbox.put(_Retry())
 
     # -- to the application ------------------------------------------------------------------------------------------------
 
