@@ -22,6 +22,9 @@ ANSWER = 256 << 10
 RANGES = 64
 """Of a request."""
 
+_Kept = tuple[int, int, float, bytes | bytearray, bool]
+"""Last and first sequence number, when, packet, does it confirm others?"""
+
 _RANGE = struct.Struct(">QQ")
 _FLOOR = struct.Struct(">Q")
 _LENGTH = struct.Struct(">I")
@@ -38,9 +41,7 @@ class History:
         """
         self._limit, self._size, self._max_age = packets, size, max_age
         self._lock = threading.Lock()
-        self._packets: deque[tuple[int, int, float, bytes | bytearray, bool]] = (
-            deque()
-        )  # last, first, when, packet, confirms
+        self._packets: deque[_Kept] = deque()
         self._held = 0
         self._confirms = False
 
@@ -63,8 +64,8 @@ class History:
                 self._held -= len(self._packets.popleft()[3])
 
     def find(self, ranges: Iterable[tuple[int, int]], size: int = ANSWER) -> tuple[int, list[bytes | bytearray]]:
-        """The lowest sequence number kept, and the packets with messages in the ranges, oldest first, up to `size` bytes; and
-        one more, if that confirms them."""
+        """The lowest sequence number kept, and the packets with messages in the ranges, oldest first, up to `size` bytes; one
+        more, if that confirms them."""
         with self._lock:
             kept = list(self._packets)
         found: list[bytes | bytearray] = []
@@ -98,7 +99,7 @@ class History:
         return b"".join([_FLOOR.pack(floor), *(part for packet in packets for part in (_LENGTH.pack(len(packet)), packet))])
 
 
-def _within(kept: list[tuple[int, int, float, bytes | bytearray, bool]], ranges: Iterable[tuple[int, int]]) -> Iterator[int]:
+def _within(kept: list[_Kept], ranges: Iterable[tuple[int, int]]) -> Iterator[int]:
     """Indices of the packets with messages in the ranges, each once."""
     done = 0
     for first, last in ranges:
