@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.timing import machine
 
-NAMES = ("loop", "allocation", "engine", "gates", "memory")
+NAMES = ("loop", "allocation", "engine", "tasks", "gates", "memory")
 
 
 def main() -> None:
