@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
 DEMO := runs/demo
 
-.PHONY: demo test lint docs examples results bench clean help
+.PHONY: demo test robosuite lint docs examples results bench clean help
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -19,6 +19,13 @@ demo: $(INSTALLED) ## 100 robots, 10 humans: C.U.R. against behaviour cloning, s
 
 test: $(INSTALLED) $(SYSTEM) ## all tests
 	$(BIN)/pytest -n auto --dist loadfile
+
+# robosuite needs numpy 1, so it has an environment of its own.
+robosuite: ## tests of the extra robosuite
+	$(PYTHON) -m venv .venv-robosuite
+	.venv-robosuite/bin/pip install -q --disable-pip-version-check "$$(grep ^torch== constraints-robosuite.txt)"
+	.venv-robosuite/bin/pip install -q --disable-pip-version-check -c constraints-robosuite.txt -e '.[robosuite]' pytest hypothesis
+	.venv-robosuite/bin/pytest tests/envs/test_robosuite_fleet.py
 
 lint: $(INSTALLED) ## ruff, mypy, import contracts
 	$(BIN)/ruff check .
@@ -41,7 +48,7 @@ bench: $(INSTALLED) ## the speed claims, as ratios on this machine
 	$(BIN)/python -m benchmarks
 
 clean: ## remove the environment and the demo's runs
-	rm -rf $(VENV) $(DEMO) site
+	rm -rf $(VENV) .venv-robosuite $(DEMO) site
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -49,9 +56,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-# Rendering tests need an OpenGL library without a screen. Installed where that is allowed (root and apt); elsewhere the
-# tests that need it skip and say so.
+# Rendering tests need an OpenGL library without a screen, network tests need tools for namespaces and address translation.
+# Installed where that is allowed (root and apt); elsewhere the tests that need them skip and say so.
 $(SYSTEM): $(INSTALLED)
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! $(BIN)/python -c "import ctypes; ctypes.CDLL('libEGL.so.1')" 2>/dev/null; then \
 	  apt-get update -qq && apt-get install -qq -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libosmesa6 >/dev/null; fi
+	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! { command -v ip && command -v nft; } >/dev/null; then \
+	  apt-get update -qq && apt-get install -qq -y --no-install-recommends iproute2 nftables >/dev/null; fi
 	touch $@

@@ -9,7 +9,9 @@ from pathlib import Path
 
 from benchmarks.timing import machine
 
-NAMES = ("loop", "allocation", "engine", "tasks", "gates", "memory")
+NAMES = (
+    "loop", "allocation", "engine", "tasks", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies"
+)  # fmt: skip
 
 
 def main() -> None:

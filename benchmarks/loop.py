@@ -19,6 +19,7 @@ from tutelage.experiments.assemble import Assembly
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.modes import MOVING
 from tutelage.fleet.step import Step
+from tutelage.learning.imitation import LearnerConfig
 
 PRETRAIN = 100
 WARM = 100
@@ -48,8 +49,10 @@ class Headcount:
 class Ours:
     """A loop that goes on from where it was at each call."""
 
-    def __init__(self, task: str, steps: int, overlap: bool) -> None:
-        self.assembly, self.steps, self.moved = ready(task, pretrain=PRETRAIN, overlap=overlap), steps, Headcount()
+    def __init__(self, task: str, steps: int, overlap: bool = False, precision: Any = "float32") -> None:
+        learner = LearnerConfig(precision=precision)
+        self.assembly, self.steps = ready(task, pretrain=PRETRAIN, overlap=overlap, learner=learner), steps
+        self.moved = Headcount()
         self.torch_threads, self.loop = torch.get_num_threads(), self.assembly.loop()
         self.loop.subscribers = [self.moved]
         self.loop.run(WARM)
@@ -150,12 +153,13 @@ def run(quick: bool = False) -> dict[str, Any]:
     return {"loop": results}
 
 
-VARIANTS = ("original", "ours", "ours, overlap", "raw physics", "raw gradients")
+VARIANTS = ("original", "ours", "ours, overlap", "ours, bfloat16", "overlap, bfloat16", "raw physics", "raw gradients")
 
 
 def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
     """One task; every variant runs `steps` timesteps in each round."""
     lockstep, overlap, floor = (Ours(task, steps, overlap=o) for o in (False, True, False))
+    low, low_overlap = (Ours(task, steps, overlap=o, precision="bfloat16") for o in (False, True))
     physics, gradients = RawPhysics(floor.assembly, floor.loop, steps), RawGradients(floor.assembly, steps)
     data, moved = lockstep.assembly.learner.dataset, Headcount()
     original = OriginalLoop(
@@ -172,9 +176,11 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         seconds = take_turns(
             {
                 "original": lambda: original.run(steps), "ours": lockstep, "ours, overlap": overlap,
+                "ours, bfloat16": low, "overlap, bfloat16": low_overlap,
                 "raw physics": physics, "raw gradients": gradients,
             }, rounds, before={
                 "original": lockstep.threads, "ours": lockstep.threads, "ours, overlap": overlap.threads,
+                "ours, bfloat16": low.threads, "overlap, bfloat16": low_overlap.threads,
                 "raw physics": physics.rewind, "raw gradients": lockstep.threads,
             },
         )  # fmt: skip
@@ -188,6 +194,8 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         "ratios": {
             "original / ours": ratio(seconds, "original", "ours"),
             "original / overlap": ratio(seconds, "original", "ours, overlap"),
+            "original / bfloat16": ratio(seconds, "original", "ours, bfloat16"),
+            "original / overlap, bfloat16": ratio(seconds, "original", "overlap, bfloat16"),
             "ours / floor": ratio(seconds, "ours", *floors),
             "overlap / floor": ratio(seconds, "ours, overlap", *floors),
         },

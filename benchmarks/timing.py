@@ -94,7 +94,9 @@ def machine() -> dict[str, Any]:
     info = Path("/proc/cpuinfo")
     models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")] \
         if info.exists() else []  # fmt: skip
-    packages = {name: metadata.version(name) for name in ("tutelage", "numpy", "torch", "mujoco", "gymnasium", "numba")}
+    names = ("tutelage", "numpy", "torch", "mujoco", "gymnasium", "numba", "cryptography")
+    there = {found.name.lower() for found in metadata.distributions() if found.name}
+    packages = {name: metadata.version(name) for name in names if name in there}
     return {
         "processor": models[0] if models else platform.processor(),
         "cores": cores,

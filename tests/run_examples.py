@@ -28,7 +28,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^<!-- run(?P<output>: output)? -->\n```(?P<kind>\w+)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
 OTHERWISE = "prints something else; run: python tests/run_examples.py --write"
-LIMIT = 600  # seconds; a hanging command must not hang the build
+LIMIT = 300  # seconds; a hanging command must not hang the build
 
 
 @dataclass
@@ -43,7 +43,8 @@ class Outcome:
 def environment() -> dict[str, str]:
     """That of a terminal without colours, in which `tutelage` and `python` are those of this interpreter."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    return {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "PATH": path, "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": "."}
+    modules = os.pathsep.join([".", *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "PATH": path, "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": modules}
 
 
 def execute(command: list[str], folder: Path) -> Outcome:

@@ -9,8 +9,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from fakes import POSITION, PointFleet
+from gymnasium.vector.utils import batch_space
 
 from tutelage.experiments.config import RunConfig
 from tutelage.learning.critic import CriticConfig
@@ -98,6 +100,50 @@ class GoalFleet(PointFleet):
 
 def goal_fleet(num_envs: int) -> GoalFleet:
     return GoalFleet(num_envs, bound=0.9, goal=0.15, horizon=25, noise=0.05, start=0.3)
+
+
+class PictureFleet(GoalFleet):
+    """The same, seen by a camera: a bright bar stands where the point is."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, bound=0.9, goal=0.15, horizon=25, noise=0.05, start=0.3)
+        self.single_observation_space = gym.spaces.Box(0, 255, (64, 64, 3), dtype=np.uint8)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+
+    @property
+    def state(self) -> Any:
+        return self.obs
+
+    def pictures(self) -> Any:
+        seen = np.full((self.num_envs, 64, 64, 3), 40, dtype=np.uint8)
+        for picture, position in zip(seen, self.obs[:, POSITION], strict=True):
+            middle = int(np.clip(32 + 30 * position, 3, 60))
+            picture[:, middle - 3 : middle + 3] = 220
+        return seen
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        _, info = super().reset(seed=seed, options=options)
+        return self.pictures(), info
+
+    def step_wait(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        _, reward, terminated, truncated, info = super().step_wait()
+        return self.pictures(), reward, terminated, truncated, info
+
+
+def picture_fleet(num_envs: int, observation: str) -> PictureFleet:
+    assert observation == "images"
+    return PictureFleet(num_envs)
+
+
+def pictures(out: Path, **changes: Any) -> RunConfig:
+    """Points seen by a camera, with a human who knows where they are: tiny heads, few and small batches."""
+    critic = CriticConfig(pretrain=3, hidden=(8,), batch=4)
+    settings = {
+        "task": "small:picture_fleet", "observation": "images", "expert": "small:Reaching", "critic": critic, "hidden": (8,),
+        "members": 2, "robots": 3, "humans": 1, "steps": 24, "offline_pairs": 30, "calibration_steps": 5,
+        "learner": {"pretrain": 3, "batch": 4, "every": 2},
+    }  # fmt: skip
+    return points(out, **{**settings, **changes})
 
 
 def contents(folder: Path) -> dict[str, Any]:

@@ -222,7 +222,7 @@ def refused(said: Said) -> str:
         (["run", "Walker2d", "--bogus", "3"], "Unrecognized options: --bogus"),
         (["run", "Walker2d", "--robot", "3"], "--robots"),
         (["rnu", "Walker2d"], "rnu"),
-        ([], "{run, resume, evaluate, report, reproduce, train-expert, watch, check, info}"),
+        ([], "{run, resume, evaluate, report, reproduce, train-expert, watch, check, info"),
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
@@ -248,7 +248,8 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
     [
         (
             ["run", "Walkr2d"],
-            f"unknown task 'Walkr2d' (did you mean Walker2d?); tasks: {', '.join(TASKS)}, or your own as module:callable",
+            f"unknown task 'Walkr2d' (did you mean Walker2d?); tasks: {', '.join(TASKS)}, NutAssemblyRound, "
+            "or your own as module:callable",
         ),
         (["run", "nowhere:make"], "task 'nowhere:make': no module 'nowhere'; install it, or run where Python finds it"),
         (

@@ -17,12 +17,16 @@ from tutelage.experiments.config import RunConfig
 from tutelage.fleet.modes import INVALID, TABLE, Event, Mode
 from tutelage.fleet.priority import TERMS
 from tutelage.learning.critic import CriticConfig
+from tutelage.policies.networks import hidden_layers
+from tutelage.policies.vision import HEAD
+from tutelage.sgc.commands import keys, proxy
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "results").glob("*.md")],
 )
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+GROUPS = {"keys": keys, "proxy": proxy}
 GENERATED = {"runs", "site", "dist"}
 
 
@@ -100,13 +104,13 @@ def test_pages_of_the_site_link_to_nothing_outside_of_it() -> None:
 
 @cache
 def manual(verb: str) -> str | None:
-    """What `tutelage VERB --help` prints; None: there is no such verb."""
+    """What `tutelage VERB --help` prints; None: there is no such verb. Of a group, the verb is two words: "keys init"."""
     import io
     from contextlib import redirect_stderr, redirect_stdout
 
     out = io.StringIO()
     with redirect_stdout(out), redirect_stderr(out), pytest.raises(SystemExit) as end:
-        main([verb, "--help"])
+        main([*verb.split(), "--help"])
     return None if end.value.code else out.getvalue()
 
 
@@ -122,6 +126,8 @@ def commands(page: Path) -> list[str]:
 def test_commands_and_their_options_exist(page: Path) -> None:
     for command in commands(page):
         verb, *words = command.partition("  #")[0].split()
+        if words and verb in GROUPS:
+            verb = f"{verb} {words.pop(0)}"
         text = manual(verb)
         assert text is not None, f"tutelage {command}: no such verb"
         for option in (word.partition("=")[0] for word in words if word.startswith("--")):
@@ -132,7 +138,9 @@ def test_commands_and_their_options_exist(page: Path) -> None:
 def test_options_in_code_spans_exist(page: Path) -> None:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     own = {"--check", "--write", "--strict", "--seeds", "--ablations"}  # of tables, run_examples, mypy, study
-    known = "".join(filter(None, map(manual, ("run", "evaluate", "report", "reproduce", "train-expert", "check", "watch"))))
+    verbs = ["run", "evaluate", "report", "reproduce", "train-expert", "check", "watch"]
+    verbs += [f"{group} {verb}" for group, module in GROUPS.items() for verb in module.VERBS]
+    known = "".join(filter(None, map(manual, verbs)))
     for option in set(re.findall(r"`(--[a-z][\w.-]*)", text)) - own:
         assert option in known, f"no verb has {option}"
 
@@ -207,7 +215,7 @@ def test_every_term_of_a_priority_is_documented() -> None:
 
 def test_the_numbers_of_the_algorithms_are_the_defaults() -> None:
     page = re.sub(r"\s+", " ", (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8"))
-    run, critic = RunConfig("Walker2d"), CriticConfig()
+    run, critic, hidden = RunConfig("Walker2d"), CriticConfig(), hidden_layers(17, None)
     periods = {task.initial_period for task in TASKS.values() if task.name != "Humanoid"}
     assert len(periods) == 1
     for said in (
@@ -218,7 +226,8 @@ def test_the_numbers_of_the_algorithms_are_the_defaults() -> None:
         f"({critic.pretrain:,} gradient steps, a quarter of each batch violations)",
         f"discount is {critic.gamma} and their target moves by {critic.tau} a gradient step",
         f"updated every {critic.every} timesteps",
-        f"an ensemble of {run.members} networks ({len(run.hidden)} × {run.hidden[0]} ReLU",
+        f"an ensemble of {run.members} networks ({len(hidden)} × {hidden[0]} ReLU",
+        f"then fully connected layers of {', '.join(map(str, HEAD[:-1]))} and {HEAD[-1]}",
         f"| offline pairs | {MujocoTask.offline_pairs:,}, but {TASKS['Ant'].offline_pairs} for Ant;",
         f"| gradient steps before the run | {run.learner.pretrain:,} |",
         f"| gradient steps a timestep | {run.learner.gradient_steps}, of {run.learner.batch} pairs a member |",

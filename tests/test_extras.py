@@ -27,7 +27,7 @@ def python(code: str, folder: Path, missing: list[str]) -> subprocess.CompletedP
 
 
 def test_the_core_needs_no_extra(tmp_path: Path) -> None:
-    extras = ["mujoco", "numba", "llvmlite", "matplotlib", "pyarrow", "tensorboard", "envpool", "imageio"]
+    extras = ["mujoco", "numba", "llvmlite", "matplotlib", "pyarrow", "tensorboard", "envpool", "robosuite", "imageio"]
     code = (
         "import tutelage.fleet.loop, tutelage.learning.imitation, tutelage.policies.ensemble, tutelage.checks, tutelage.cli"
     )
@@ -38,6 +38,7 @@ def test_the_core_needs_no_extra(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("missing", "verb", "extra"),
     [("mujoco", "['run', 'Walker2d']", "mujoco"), ("numba", "['train-expert', 'Ant']", "mujoco"),
+     ("robosuite", "['run', 'NutAssemblyRound']", "robosuite"),
      ("torch.utils.tensorboard", "['run', 'Walker2d', '--tensorboard']", "tensorboard")],
 )  # fmt: skip
 def test_what_needs_an_extra_names_it(missing: str, verb: str, extra: str, tmp_path: Path) -> None:
@@ -46,3 +47,17 @@ def test_what_needs_an_extra_names_it(missing: str, verb: str, extra: str, tmp_p
     assert said.stderr.count("\n") == 1
     assert f"pip install 'tutelage[{extra}]'" in said.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("verb", ["keys", "router", "proxy", "ping", "top"])
+def test_connectivity_loads_no_learning_library(verb: str, tmp_path: Path) -> None:
+    code = f"""
+import contextlib
+from tutelage.cli import main
+with contextlib.suppress(SystemExit):
+    main(["{verb}", "--help"])
+assert not {{"torch", "numpy", "gymnasium"}} & set(sys.modules)
+"""
+    said = python(code, tmp_path, [])
+    assert said.returncode == 0, said.stderr
+    assert f"usage: tutelage {verb}" in said.stdout

@@ -10,8 +10,9 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -21,13 +22,17 @@ from tyro.conf import Positional, arg
 
 from tutelage import __version__
 from tutelage.errors import ConfigError, TutelageError
-from tutelage.experiments.config import ExpertConfig, RunConfig
-from tutelage.experiments.watch import WatchConfig
+from tutelage.sgc.commands import keys, proxy
+from tutelage.sgc.commands.ping import ping
+from tutelage.sgc.commands.router import router
+from tutelage.sgc.commands.top import top
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from tutelage.experiments.config import ExpertConfig, RunConfig
     from tutelage.experiments.run import Run
+    from tutelage.experiments.watch import WatchConfig
     from tutelage.fleet.loop import Loop
     from tutelage.fleet.step import Subscriber
 
@@ -117,7 +122,7 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
 
 
 def reproduce(
-    what: Positional[Literal["figure-2.3", "figure-5.3", "figure-C.1"]],
+    what: Positional[Literal["figure-2.3", "figure-A.1", "table-3.1", "table-3.3", "gates", "figure-5.3", "figure-C.1"]],
     tasks: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
     full: bool = False,
@@ -128,10 +133,13 @@ def reproduce(
     """A figure or table of the dissertation: all algorithms and seeds in parallel, resumable, published beside ours.
 
     Args:
-        what: figure-2.3 (LazyDAgger and its rivals), figure-5.3 (Fleet-DAgger's comparison, with table C.2), figure-C.1 (the
+        what: figure-2.3 (LazyDAgger and its rivals), figure-A.1 (its sensitivity to its thresholds), table-3.1
+            (ThriftyDAgger and its rivals on peg insertion), table-3.3 (on cable routing from images), gates (all of them
+            with 100 robots and 10 humans), figure-5.3 (Fleet-DAgger's comparison, with table C.2), figure-C.1 (the
             ablations of C.U.R.).
         tasks: which tasks; default: those of the figure.
-        seeds: root seeds; default: 0 to 4 for figure-2.3, else 0 to 2.
+        seeds: root seeds; default: 0 to 4 for figure-2.3, table-3.1 and gates (table-3.3: with --full), 0 for figure-A.1,
+            else 0 to 2.
         full: the published scale; default: one that takes less than an hour on 4 cores.
         workers: runs side by side, one core each.
         out: folder of the run folders.
@@ -314,17 +322,6 @@ def _print_table(head: list[str], rows: list[list[str]]) -> None:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of `tutelage`: exits with 0, or with 2 and one clear line."""
-    verbs: dict[str, Any] = {
-        "run": run,
-        "resume": resume,
-        "evaluate": evaluate,
-        "report": report,
-        "reproduce": reproduce,
-        "train-expert": train_expert,
-        "watch": watch,
-        "check": check,
-        "info": info,
-    }
     arguments = list(sys.argv[1:] if args is None else args)
     if arguments == ["--version"]:
         print(f"tutelage {__version__}")
@@ -332,6 +329,8 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # so that module:callable finds a file of the user's in the present folder
     try:
+        connectivity = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
+        verbs = connectivity if arguments[:1] and arguments[0] in connectivity else _learning_verbs() | connectivity
         _parse(verbs, arguments)()
         sys.stdout.flush()
     except TutelageError as error:
@@ -345,10 +344,49 @@ def main(args: Sequence[str] | None = None) -> None:
         raise SystemExit(1) from None
 
 
-def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Callable[[], None]:
-    """The call that the arguments ask for. The parser's boxes become one line, like every other error."""
+def _learning_verbs() -> dict[str, Any]:
+    """The verbs that need PyTorch, which takes seconds and memory that a router or robot may not have."""
+    from tutelage.experiments import config
+    from tutelage.experiments import watch as film
 
-    def later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    # The parser looks up annotations among this module's names.
+    globals().update(RunConfig=config.RunConfig, ExpertConfig=config.ExpertConfig, WatchConfig=film.WatchConfig)
+    return {
+        "run": run,
+        "resume": resume,
+        "evaluate": evaluate,
+        "report": report,
+        "reproduce": reproduce,
+        "train-expert": train_expert,
+        "watch": watch,
+        "check": check,
+        "info": info,
+    }
+
+
+def _parse(
+    verbs: Mapping[str, Any],
+    arguments: list[str],
+    prog: str = "tutelage",
+    description: str = "Supervised autonomy for robot fleets.",
+) -> Callable[[], None]:
+    """The call that the arguments ask for. The parser's boxes become one line, like every other error.
+
+    verbs: functions, or modules with `VERBS` of their own.
+    """
+    group = verbs.get(arguments[0]) if arguments else None
+    if isinstance(group, ModuleType):
+        return _parse(group.VERBS, arguments[1:], f"{prog} {arguments[0]}", group.__doc__ or "")
+
+    def later(verb: Any) -> Callable[..., Callable[[], None]]:
+        if isinstance(verb, ModuleType):  # here for the help only
+
+            def named() -> Callable[[], None]:
+                raise AssertionError(f"{verb.__name__} is parsed above")
+
+            named.__doc__ = verb.__doc__
+            return named
+
         @functools.wraps(verb)
         def call(*args: Any, **kwargs: Any) -> Callable[[], None]:
             return functools.partial(verb, *args, **kwargs)
@@ -360,9 +398,9 @@ def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Calla
         with contextlib.redirect_stderr(said):
             chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
                 {name: later(verb) for name, verb in verbs.items()},
-                prog="tutelage",
+                prog=prog,
                 args=arguments,
-                description="Supervised autonomy for robot fleets.",
+                description=description,
             )
         return chosen
     except SystemExit as stop:
@@ -373,4 +411,4 @@ def _parse(verbs: dict[str, Callable[..., None]], arguments: list[str]) -> Calla
     meant = re.search(r"Perhaps you meant:\s+(-\S+)", " ".join(lines))
     hint = f"; did you mean {meant[1]}?" if meant else ""
     verb = f" {arguments[0]}" if arguments and arguments[0] in verbs else ""
-    raise ConfigError(f"{problem}{hint} (see tutelage{verb} --help)")
+    raise ConfigError(f"{problem}{hint} (see {prog}{verb} --help)")

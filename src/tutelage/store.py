@@ -6,9 +6,7 @@ No pickle anywhere: a file from a stranger can be wrong, but it cannot run code.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,28 +15,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as save_bytes
 
 from tutelage.errors import TutelageError
+from tutelage.files import write_atomic as write_atomic
 
 Tree = dict[str, Any]
-
-
-def write_atomic(path: Path, content: bytes) -> None:
-    """Replace `path` by `content`, or leave it as it was and raise.
-
-    Raises:
-        TutelageError: the disk is full or the folder cannot be written.
-    """
-    beside = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(beside, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            beside.unlink()
-        raise TutelageError(f"cannot write {path}: {error.strerror}; free some space or choose another folder") from None
 
 
 def save_tree(path: Path, tree: Tree) -> None:

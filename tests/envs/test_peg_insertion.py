@@ -309,7 +309,7 @@ def test_the_picture_shows_arm_ring_and_peg(arms: MujocoFleet) -> None:
 def test_a_demonstration_ends_with_its_success_and_the_next_one_begins_anew() -> None:
     config = RunConfig("PegInsertion", disturbance="none", offline_pairs=450, threads=1)
     actor = PegInserter()
-    obs, actions = demonstrations(config, actor, 175)
+    obs, actions = demonstrations(config, actor, 175)[:2]
     assert obs.shape == (450, 41)
     np.testing.assert_allclose(actions, actor.act(obs), atol=1e-3)
     jumps = np.linalg.norm(np.diff(obs[:, GRIP], axis=0), axis=1) > 2 * STEP  # from the peg back to the start

@@ -39,5 +39,7 @@ def test_a_level_suits_when_the_expert_can_and_the_clone_cannot(
     assert [(r["level"], r["offline_pairs"], r["chosen"]) for r in rows] == [
         ("mild", 5000, False), ("moderate", 5000, True), ("moderate", 100, False),
     ]  # fmt: skip
+    levels.main([*arguments, "--observation", "images"])  # and so is what is observed
+    assert [r.get("observation") for r in json.loads(path.read_text())["Walker2d"]] == [None, None, None, "images"]
     assert {r["suits"] for r in rows} == {suits}
     assert ("does not suit" in capsys.readouterr().out) is not suits

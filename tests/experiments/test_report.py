@@ -19,6 +19,7 @@ from tutelage.experiments import plots
 from tutelage.experiments.recording import Recorder
 from tutelage.experiments.records import load_run, load_runs
 from tutelage.experiments.report import differences, summary_table, write_report
+from tutelage.fleet.attempts import attempts, request_rate
 from tutelage.fleet.events import Events
 from tutelage.fleet.metrics import EventLog, summary
 from tutelage.fleet.modes import Event, Mode
@@ -109,6 +110,8 @@ def test_a_run_folder_is_loaded(run: Path) -> None:
     assert np.isnan(loaded.metrics["loss/policy"][:2]).all()
     assert loaded.final["successes"] == summary(loaded.log)["successes"] > 0
     assert loaded.final["intervention_length"] == 3
+    assert loaded.final["request_rate"] == request_rate(loaded.log) > 0
+    assert loaded.final["episode/human_actions"] == attempts(loaded.log).human_actions.mean()
     assert loaded.evaluation == {}
     assert loaded.disagreement == ""
 

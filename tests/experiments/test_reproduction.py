@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small import Here
+from small import Here, walker
 
 from tutelage.errors import ConfigError
-from tutelage.experiments import figure_2_3, jobs, reproduction
+from tutelage.experiments import figure_2_3, gates_table, jobs, reproduction, table_3
 from tutelage.experiments.figure_2_3 import ALGORITHMS, BC, LAZY, SAFE, Figure23Config, configuration
 from tutelage.learning.critic import CriticConfig
 
@@ -55,7 +55,7 @@ def test_figure_2_3_from_runs_to_table_and_picture(tiny: None, tmp_path: Path, c
     lazy = np.mean([r["epochs"][-1]["supervisor_actions"] for r in results if r["algorithm"] == LAZY])
     cloning = next(r for r in results if r["algorithm"] == BC)
     assert cloning["config"]["offline_pairs"] == 100 + round(lazy)
-    assert figure_2_3.table(figure_2_3.read(place)) == text
+    assert figure_2_3.table(jobs.read_results(place)) == text
     assert "| Walker2d | -56% |" in text
     assert (place / "figure.png").stat().st_size > 20_000
     assert f"Walker2d {LAZY} seed 1: return" in capsys.readouterr().out
@@ -93,3 +93,112 @@ def test_the_cutoff_latency_and_the_change_are_those_of_the_means() -> None:
 def test_what_figure_2_3_does_not_have_is_refused() -> None:
     with pytest.raises(ConfigError, match="figure 2.3 has the tasks HalfCheetah, Walker2d, Ant; got Humanoid"):
         Figure23Config(tasks=("Humanoid",))
+
+
+# -- table 3.1, figure A.1, all gates ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Peg insertion for 30 timesteps, in this process: 8 timesteps make an episode."""
+    make = table_3.configuration
+
+    def small(*args: Any) -> Any:
+        config = make(*args)
+        steps = (
+            {"gradient_steps": 1, "pretrain": 1} if config.observation == "images" else {"gradient_steps": 5, "pretrain": 20}
+        )
+        learner = dataclasses.replace(config.learner, every=20, batch=16, **steps)
+        pairs = 120 if config.algorithm != BC else 180
+        return dataclasses.replace(
+            config, steps=30, checkpoint_every=20, metrics_every=10, learner=learner, hidden=(16,), calibration_steps=10,
+            offline_pairs=pairs, members=2, critic=dataclasses.replace(config.critic, pretrain=5, hidden=(16,)),
+        )  # fmt: skip
+
+    monkeypatch.setattr(table_3, "configuration", small)
+    settings = {name: dataclasses.replace(setting, tests=2, aided=1) for name, setting in table_3.SETTINGS.items()}
+    monkeypatch.setattr(table_3, "SETTINGS", settings)
+    monkeypatch.setattr(jobs, "ProcessPoolExecutor", Here)
+
+
+def test_table_3_1_from_runs_to_published_and_ours(short: None, tmp_path: Path) -> None:
+    where = (tmp_path / "runs", tmp_path / "results")
+    text = reproduction.reproduce("table-3.1", (), (0,), False, 1, *where)
+    place = tmp_path / "results" / "single" / "table-3.1"
+    results = [json.loads(path.read_text()) for path in sorted(place.glob("*.json"))]
+    assert {r["algorithm"] for r in results} == set(table_3.SETTINGS["table-3.1"].published)
+    assert all(r["metrics"]["t"] == 30 for r in results)
+    assert "| ThriftyDAgger | published | 0.88 ± 1.01 | 43.6 ± 24.5 | 60.0 ± 32.8 | 73/100 |" in text
+    assert all(("aided" in r) == (r["algorithm"] != table_3.BC) for r in results)
+    assert reproduction.reproduce("table-3.1", (), (0,), False, 1, *where) == text, "what is complete is kept"
+    with pytest.raises(ConfigError, match=r"table-3\.1 is about PegInsertion; leave out --tasks"):
+        reproduction.reproduce("table-3.1", ("Walker2d",), (0,), False, 1, *where)
+
+
+@pytest.mark.render
+def test_table_3_3_is_made_from_images(opengl: None, short: None, tmp_path: Path) -> None:
+    text = reproduction.reproduce("table-3.3", (), (0,), False, 1, tmp_path / "runs", tmp_path / "results")
+    place = tmp_path / "results" / "single" / "table-3.3"
+    results = [json.loads(path.read_text()) for path in sorted(place.glob("*.json"))]
+    assert {r["algorithm"] for r in results} == {table_3.BC, table_3.HG, table_3.THRIFTY}
+    assert {r["config"]["observation"] for r in results} == {"images"}
+    assert "| ThriftyDAgger | published | 1.42 ± 1.14 | 15.2 ± 12.4 | 45.5 ± 18.3 | 12/15 |" in text
+    assert "| Behaviour cloning | published | – | – | – | 0/15 |" in text
+
+
+def test_the_settings_are_those_of_appendix_b_2() -> None:
+    setting = table_3.SETTINGS["table-3.1"]
+    lazy, thrifty = (table_3.configuration(setting, name) for name in (table_3.LAZY, table_3.THRIFTY))
+    assert (lazy.steps, lazy.offline_pairs, lazy.learner.batch, lazy.learner.learning_rate) == (10_000, 2687, 100, 1e-3)
+    assert lazy.gate.beta_h == pytest.approx(7.5e-4)
+    assert (thrifty.gate.alpha, thrifty.critic.gamma, thrifty.critic.positives) == (0.01, 0.9999, 0.1)
+    assert table_3.configuration(setting, table_3.BC).offline_pairs == 4004
+    assert table_3.configuration(setting, table_3.NO_RISK).gate.without == "risk"
+    seen = table_3.configuration(table_3.SETTINGS["table-3.3"], table_3.THRIFTY)
+    assert (seen.task, seen.observation, seen.steps, seen.offline_pairs) == ("CableRouting", "images", 1500, 1381)
+    assert (seen.learner.batch, seen.learner.learning_rate, seen.learner.pretrain) == (64, 2.5e-4, 5 * 300)
+    assert (seen.learner.every, seen.calibration_steps, seen.members) == (500, 5 * 100, 5)
+    assert (seen.critic.batch, seen.critic.learning_rate, seen.critic.gamma) == (64, 2.5e-4, 0.9999)
+    assert table_3.configuration(table_3.SETTINGS["table-3.3"], table_3.BC).offline_pairs == 1381
+
+
+def test_counts_are_pooled_over_the_episodes_of_all_seeds() -> None:
+    one, two = np.array([1.0, 3.0, 8.0]), np.array([2.0])
+    parts = [{"episodes": len(v), "interventions": [v.mean(), v.std()], "human": None, "robot": None} for v in (one, two)]
+    both = np.concatenate([one, two])
+    cells = table_3._pooled([{"training": part} for part in parts], "training")
+    assert cells == [f"{both.mean():.2f} ± {both.std():.2f}", "–", "–"]
+
+
+def test_figure_a_1_has_nine_settings_a_task(tiny: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = reproduction.reproduce("figure-A.1", ("Walker2d",), (), False, 1, tmp_path / "runs", tmp_path / "results")
+    place = tmp_path / "results" / "single" / "figure-A.1"
+    gates = [json.loads(path.read_text())["config"]["gate"] for path in (place / "Walker2d").glob("*.json")]
+    assert len({(g["beta_h"], g["beta_r"]) for g in gates}) == 9
+    assert sum(line.startswith("| Walker2d |") for line in text.splitlines()) == 9
+    assert (place / "figure.png").stat().st_size > 10_000
+
+
+def test_every_gate_is_in_the_table_of_the_fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = gates_table.configurations
+
+    def small(config: Any) -> Any:
+        return {
+            name: walker(
+                tmp_path,
+                priority=run.priority,
+                gate=run.gate,
+                label=name,
+                record="none",
+                steps=12,
+                learner={"schedule": run.learner.schedule},
+            )
+            for name, run in make(config).items()
+        }
+
+    monkeypatch.setattr(gates_table, "configurations", small)
+    monkeypatch.setattr(jobs, "ProcessPoolExecutor", Here)
+    text = reproduction.reproduce("gates", (), (0,), False, 1, tmp_path / "runs", tmp_path / "results")
+    rows = [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines()[4:]]
+    assert rows == ["Behaviour cloning (C.)", "DAgger", "SafeDAgger", "EnsembleDAgger", "LazyDAgger",
+                    "ThriftyDAgger (-Risk)", "HG-DAgger", "C.U.R."]  # fmt: skip

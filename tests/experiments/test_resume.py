@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from interruptions import At, die, die_after, killed, resume, stop
 from small import FLAGS, assert_same, contents, edit_config, points, walker
 
 from tutelage.errors import RunFolderError
@@ -24,56 +24,12 @@ from tutelage.experiments.live import LivePlots
 from tutelage.experiments.recording import lock
 from tutelage.experiments.run import Checkpoints, Run
 from tutelage.fleet.loop import Loop
-from tutelage.fleet.step import Step
 from tutelage.store import load_tree
 
 pytest.importorskip("mujoco")
 pytest.importorskip("pyarrow")
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["tutelage.experiments.run", "tutelage.envs.mujoco_fleet", "pyarrow.parquet", "small"])
-
-
-class At:
-    """Does something when a timestep is over: after it is written down, before a checkpoint is due."""
-
-    def __init__(self, t: int, what: Callable[[Loop], Any]) -> None:
-        self.t, self.what = t, what
-
-    def on_start(self, loop: Loop) -> None:
-        pass
-
-    def on_step(self, loop: Loop, step: Step) -> None:
-        if loop.t == self.t:
-            self.what(loop)
-
-    def on_end(self, loop: Loop) -> None:
-        pass
-
-
-def die(loop: Loop | None = None) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def stop(loop: Loop) -> None:
-    loop.stop_requested = True
-
-
-def killed(target: Callable[..., None], *args: Any) -> None:
-    """Run `target` in a process of its own, which must not survive."""
-    process = FORKS.Process(target=target, args=args)
-    process.start()
-    process.join(120)
-    assert process.exitcode == -signal.SIGKILL
-
-
-def resume(folder: Path) -> int:
-    """Continue to the end; returns the timestep at which the run went on."""
-    run = Run.resume(folder)
-    t = run.loop.t
-    run.run()
-    return t
 
 
 # -- killed at a known point, with every feature that has a state ---------------------------------------------------
@@ -88,10 +44,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "overlap": True, "latency": 1, "supervisor_noise": 0.2, "learner": {"schedule": "episode"}, "priority": "U.R.C.",
     },
 }  # fmt: skip
-
-
-def die_after(config: RunConfig, t: int) -> None:
-    Run.start(config).run([At(t, die)])
 
 
 @pytest.mark.parametrize(

@@ -91,3 +91,19 @@ def test_it_continues_bit_for_bit_after_a_round_trip_of_its_state() -> None:
     obs = torch.randn(7, 3).numpy()
     np.testing.assert_array_equal(one(obs), other(obs))
     assert other.beta_h == 0.1
+
+
+def test_a_classifier_sees_what_its_policy_sees() -> None:
+    """Images that are bright where the human would act."""
+    policy = EnsemblePolicy((64, 64, 3), LOW, HIGH, members=1)
+    policy.act = lambda obs: np.zeros((len(obs), 2), np.float32)  # type: ignore[method-assign]
+    bright = default_rng(0).random(40) > 0.5
+    obs = np.where(bright[:, None, None, None], 200, 20).astype(np.uint8) * np.ones((1, 64, 64, 3), np.uint8)
+    policy.set_normalisation(obs)
+    dataset = AggregatedDataset((64, 64, 3), 2, 1, default_rng(1), dtype=torch.uint8)
+    classifier = DiscrepancyClassifier(policy, dataset, default_rng(2), 0, beta_h=0.1, batch=16)
+    dataset.add(obs[:30], 0.8 * np.repeat(bright[:30, None], 2, axis=1))
+    classifier.held_out.add(obs[30:], 0.8 * np.repeat(bright[30:, None], 2, axis=1))
+    assert classifier.held_out.obs.rows.dtype == torch.uint8
+    classifier.updates(40)
+    assert ((classifier(obs) >= 0.5) == bright).all()

@@ -89,6 +89,28 @@ def test_the_state_of_a_ring_stays_as_it_was_while_the_ring_goes_round() -> None
     assert state["rows"][:, 0].tolist() == [0, 1, 2, 3, 4]
 
 
+def pictures(first: int, n: int, size: tuple[int, int] = (5, 4)) -> dict[str, np.ndarray]:
+    """n transitions between images, that can be told apart."""
+    obs = default_rng(first).integers(0, 256, (n + 1, *size, 3), dtype=np.uint8)
+    action = default_rng(first).uniform(-1, 1, (n, 2)).astype(np.float32)
+    return {"obs": obs[:-1], "action": action, "next_obs": obs[1:], "end": np.arange(n) % 2 == 0}
+
+
+def test_images_are_kept_as_the_bytes_that_they_are_and_numbers_to_the_bit(tmp_path) -> None:
+    ring, seen = Ring(8, (5, 4, 3), 2), pictures(0, 11)
+    for part in (slice(0, 2), slice(2, 11)):
+        ring.add(ring.pack(**{name: column[part] for name, column in seen.items()}))
+    assert ring.rows.dtype == torch.uint8
+    assert ring.rows.shape == (8, 2 * 60 + 3 * 4)
+    save_tree(tmp_path / "ring", ring.state_dict())
+    again = Ring(8, (5, 4, 3), 2)
+    again.load_state_dict(load_tree(tmp_path / "ring"))
+    for kept in (ring, again):
+        index = torch.from_numpy((kept.cursor + np.arange(8)) % 8)
+        for name, column in kept.columns(kept.rows[index]).items():
+            np.testing.assert_array_equal(column, seen[name][3:].astype(column.numpy().dtype))
+
+
 # -- what a critic estimates ----------------------------------------------------------------------------------------
 
 GAMMA, LENGTH = 0.8, 5
@@ -259,3 +281,49 @@ def test_after_a_round_trip_to_disk_a_critic_continues_bit_for_bit(tmp_path) -> 
 def test_impossible_hyper_parameters_are_refused(wrong) -> None:
     with pytest.raises(ConfigError):
         CriticConfig(**wrong)
+
+
+# -- critics that see images ----------------------------------------------------------------------------------------
+
+
+class Pointing:
+    """A robot policy that goes where the first pixel says."""
+
+    def act(self, obs):
+        assert obs.dtype == np.uint8
+        return (obs[:, 0, 0, :2] / 127.5 - 1).astype(np.float32)
+
+
+def seeing(batch: int = 8, seed: int = 0) -> Critic:
+    scale = torch.full((3,), 127.0), torch.full((3,), 74.0), torch.zeros(2), torch.ones(2)
+    config = CriticConfig(batch=batch, gamma=0.9, learning_rate=1e-9, capacity=40)
+    return SpyCritic((64, 64, 3), 2, "good", Pointing(), config, scale, default_rng(seed), seed)
+
+
+def test_a_critic_of_images_has_the_targets_of_any_other() -> None:
+    critic, seen = seeing(), pictures(0, 6, (64, 64))
+    critic.add(**{**seen, "event": never(6), "end": never(6)})
+    loss = critic.update()
+    (_, after, then, future), (_, _, _, now) = critic.asked[-2:]
+    np.testing.assert_array_equal(then, Pointing().act(after.numpy()))
+    assert loss == pytest.approx(float((now - 0.9 * future.amin(0)).square().mean()), rel=1e-5)
+    q = critic(seen["obs"], seen["action"])
+    assert q.shape == (6,)
+    assert ((q > 0) & (q < 1)).all()
+    assert not np.allclose(q, critic(seen["obs"], -seen["action"])), "the action counts"
+
+
+def test_after_a_round_trip_to_disk_a_critic_of_images_continues_bit_for_bit(tmp_path) -> None:
+    critic, again = seeing(), seeing(seed=5)
+    for k in range(3):
+        critic.add(**pictures(k, 4, (64, 64)), event=np.arange(4) == 3)
+        critic.update()
+    save_tree(tmp_path / "critic", critic.state_dict())
+    again.load_state_dict(load_tree(tmp_path / "critic"))
+    assert [critic.update() for _ in range(3)] == [again.update() for _ in range(3)]
+
+
+def test_a_step_in_which_no_robot_that_sees_moved_is_no_transition() -> None:
+    ring, none = Ring(8, (2, 2, 3), 1), np.zeros((0, 2, 2, 3), dtype=np.uint8)
+    ring.add(ring.pack(none, np.zeros((0, 1)), none, np.zeros(0, dtype=bool)))
+    assert ring.size == 0

@@ -101,6 +101,22 @@ def test_images_keep_their_shape() -> None:
     assert dataset.batches(4)[0].shape == (2, 4, 3, 8, 8)
 
 
+def test_images_are_kept_and_drawn_as_the_bytes_that_they_are(tmp_path) -> None:
+    seen = default_rng(0).integers(0, 256, (300, 4, 5, 3), dtype=np.uint8)
+    dataset = AggregatedDataset((4, 5, 3), 1, 2, default_rng(0), dtype=torch.uint8)
+    dataset.add(seen[:200], np.arange(200.0)[:, None])
+    save_tree(tmp_path / "data", dataset.state_dict())
+    again = AggregatedDataset((4, 5, 3), 1, 2, default_rng(1), dtype=torch.uint8)
+    again.load_state_dict(load_tree(tmp_path / "data"))
+    for d in (dataset, again):
+        d.add(seen[200:], np.arange(200.0, 300.0)[:, None])
+        assert d.obs.rows.dtype == torch.uint8
+        np.testing.assert_array_equal(d.obs.rows, seen)
+        obs, actions = d.batches(50)
+        assert obs.dtype == torch.uint8
+        np.testing.assert_array_equal(obs, seen[actions[:, :, 0].long().numpy()])
+
+
 def test_after_a_round_trip_to_disk_bags_and_batches_continue_alike(tmp_path) -> None:
     dataset = filled(300)
     save_tree(tmp_path / "data", dataset.state_dict())

@@ -199,9 +199,21 @@ def test_the_loss_reported_is_the_mean_over_members() -> None:
     assert learner.gradient_steps(1) == pytest.approx(float((said.detach() - 0.25).square().mean()), rel=1e-5)
 
 
+def test_lower_precision_is_for_updates_only() -> None:
+    learner, seen = make(precision="bfloat16"), []
+    learner.dataset.add(np.zeros((4, WIDTH)), np.full((4, 1), 0.25))
+    loss = learner.policy.loss
+    learner.policy.loss = lambda *batch: seen.append(torch.get_float32_matmul_precision()) or loss(*batch)
+    before = learner.policy.net(torch.zeros(1, WIDTH)).detach().clone()
+    assert 0 < learner.update(0)["policy"] < 4
+    assert (learner.policy.net(torch.zeros(1, WIDTH)) != before).any()
+    assert seen == ["medium"]
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
 @pytest.mark.parametrize(
     "wrong", [{"schedule": "weekly"}, {"every": 0}, {"gradient_steps": 0}, {"batch": 0}, {"learning_rate": 0.0},
-              {"learning_rate": float("nan")}, {"pretrain": -1}],
+              {"learning_rate": float("nan")}, {"pretrain": -1}, {"precision": "int8"}],
 )  # fmt: skip
 def test_impossible_settings_are_refused(wrong) -> None:
     with pytest.raises(ConfigError):

@@ -63,6 +63,8 @@ class Backend(ABC):
     horizon: int
     can_pause: bool = True
     """False: robots that are not stepped may go on by themselves; nobody looks at them until they are reset."""
+    can_checkpoint: bool = False
+    """Whether it has `state_dict` and `load_state_dict`."""
 
     @abstractmethod
     def reset(self, robots: Mask, seed: int | None) -> Array:
@@ -79,6 +81,14 @@ class Backend(ABC):
     def picture(self, robot: int) -> Array | None:
         """A picture of one robot, (H, W, 3) uint8, or None."""
         return None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything of the simulator that is needed to continue bit for bit."""
+        raise NotImplementedError
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        raise NotImplementedError
 
     @abstractmethod
     def close(self) -> None:
@@ -97,8 +107,6 @@ class AdaptedFleet(Fleet):
         success: which robots completed the task in a timestep; not asked about robots in violation.
     """
 
-    can_checkpoint = False
-
     def __init__(self, backend: Backend, violation: Judge, success: Judge) -> None:
         box, seen = backend.action_space, backend.obs_space
         if not isinstance(box, gym.spaces.Box) or len(box.shape) != 1:
@@ -110,7 +118,8 @@ class AdaptedFleet(Fleet):
         if backend.horizon < 1:
             raise ConfigError(f"the horizon must be at least 1 timestep, got {backend.horizon}")
         self._backend, self._violates, self._succeeds = backend, violation, success
-        self.num_envs, self.horizon, self.can_pause = backend.num_envs, backend.horizon, backend.can_pause
+        self.num_envs, self.horizon = backend.num_envs, backend.horizon
+        self.can_pause, self.can_checkpoint = backend.can_pause, backend.can_checkpoint
         self.single_action_space = gym.spaces.Box(box.low.astype(np.float32), box.high.astype(np.float32), dtype=np.float32)
         self.single_observation_space = seen
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -204,10 +213,25 @@ class AdaptedFleet(Fleet):
         self._backend.close()
 
     def state_dict(self) -> dict[str, Any]:
-        raise ConfigError("this fleet cannot be checkpointed: its simulator does not give out its state")
+        if not self.can_checkpoint:
+            raise ConfigError("this fleet cannot be checkpointed: its simulator does not give out its state")
+        return {
+            "backend": self._backend.state_dict(),
+            "obs": self._obs.copy(),
+            "elapsed": self._elapsed.copy(),
+            "return": self._return.copy(),
+            "violation": self._violation.copy(),
+            "over": self._over.copy(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        raise ConfigError("this fleet cannot be checkpointed: its simulator does not take a state")
+        if not self.can_checkpoint:
+            raise ConfigError("this fleet cannot be checkpointed: its simulator does not take a state")
+        self._backend.load_state_dict(state["backend"])
+        self._obs = state["obs"].copy()
+        self._elapsed, self._return = state["elapsed"].copy(), state["return"].copy()
+        self._violation, self._over = state["violation"].copy(), state["over"].copy()
+        self._started = True
 
 
 def _rows(mask: Mask, like: Array) -> Mask:

@@ -15,13 +15,17 @@ from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet
 
+ON_EXTRAS = {"NutAssemblyRound": "tutelage.envs.robosuite_fleet:NutAssemblyRound"}
+"""Tasks on simulators that come with an extra, which need not be installed: what makes their fleets."""
+
 GROUP = "tutelage.tasks"
 """Entry points of this group are tasks. Each names what "module:callable" may name; see `make_fleet`."""
 
 
 def task_names() -> list[str]:
-    """The tasks that `make_fleet` knows by name: built in, and of installed packages."""
-    return [*TASKS, *(name for name in _installed() if name not in TASKS)]
+    """The tasks that `make_fleet` knows by name: built in, on extras, and of installed packages."""
+    own = [*TASKS, *ON_EXTRAS]
+    return [*own, *(name for name in _installed() if name not in own)]
 
 
 def make_fleet(
@@ -35,8 +39,8 @@ def make_fleet(
     """A fleet of `num_envs` robots.
 
     Args:
-        task: a built-in task ("Walker2d"), the name of an entry point of the group "tutelage.tasks", or
-            "module:callable". The callable is a subclass of `Task`, or is called as
+        task: a built-in task ("Walker2d"), one on an extra ("NutAssemblyRound"), the name of an entry point of the group
+            "tutelage.tasks", or "module:callable". The callable is a subclass of `Task`, or is called as
             `callable(num_envs, **kwargs)` and returns a `Fleet`.
         num_envs: N robots.
         disturbance: for the built-in tasks, see `TaskFleet`. Handed to a callable only when given, like `threads`.
@@ -66,9 +70,12 @@ def find_task(task: str) -> Callable[..., Any]:
 
     Raises:
         ConfigError: an unknown task.
+        MissingExtraError: its simulator is not installed.
     """
     if task in TASKS:
         return TASKS[task]
+    if task in ON_EXTRAS:
+        return load_object(ON_EXTRAS[task], "task")
     if ":" in task:
         return load_object(task, "task")
     installed = _installed()

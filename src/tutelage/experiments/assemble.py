@@ -36,6 +36,7 @@ from tutelage.learning.imitation import ImitationLearner
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.policies.expert import GaussianActor
 from tutelage.policies.kinds import kinds_of
+from tutelage.policies.networks import hidden_layers, stored_as
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
@@ -50,6 +51,11 @@ class Assembly:
     actor: Policy
     policy: EnsemblePolicy
     learner: ImitationLearner
+
+    @property
+    def human(self) -> PolicySupervisor:
+        """The algorithmic human of this fleet; where there are kinds, all of them, see `Kinds`."""
+        return PolicySupervisor(self.actor, self.fleet)
 
     def loop(self, frozen: Policy | None = None) -> Loop:
         """The loop over these parts; thresholds must be resolved.
@@ -71,10 +77,14 @@ class Assembly:
             execution=self._execution(priority), overlap=c.overlap, seed=c.seed,
         )  # fmt: skip
 
+    def _kinds(self) -> list[PolicySupervisor]:
+        """The algorithmic humans of this fleet, one of each kind."""
+        return [PolicySupervisor(kind, self.fleet) for kind in kinds_of(self.actor)]
+
     def _supervisors(self) -> list[Supervisor]:
-        """One human of each kind."""
+        """One human of each kind, with their trembling hands."""
         c = self.config
-        supervisors: list[Supervisor] = [PolicySupervisor(kind) for kind in kinds_of(self.actor)]
+        supervisors: list[Supervisor] = [*self._kinds()]
         if c.supervisor_noise:
             sigma = c.supervisor_noise * float((self.fleet.action_high - self.fleet.action_low).mean() / 2)
             names = ["supervisor noise", *(f"supervisor noise/{k}" for k in range(1, len(supervisors)))]
@@ -84,7 +94,7 @@ class Assembly:
     def _judgement(self, view: FleetView) -> Array:
         """How much what the policy proposes differs from what a human would do; of any kind, for all of them do it well."""
         low, high = self.fleet.action_low, self.fleet.action_high
-        return np.min([discrepancy(view.actions, kind.act(view.obs), low, high) for kind in kinds_of(self.actor)], axis=0)  # type: ignore[no-any-return]
+        return np.min([discrepancy(view.actions, kind.act(view.obs), low, high) for kind in self._kinds()], axis=0)  # type: ignore[no-any-return]
 
     def _signals(self) -> dict[str, Signal]:
         """What the critics, the classifier and the humans' own judgement say."""
@@ -114,14 +124,18 @@ def assemble(config: RunConfig) -> Assembly:
     torch.set_num_threads(config.torch_threads or 1)
     priority = parse(config.priority, config.thresholds, config.gate)
     actor = _expert(config)
-    fleet = make_fleet(config.task, config.robots, disturbance=config.disturbance, threads=config.threads)
+    fleet = fleet_of(config, config.robots, config.disturbance)
 
-    width = fleet.single_observation_space.shape[0]  # type: ignore[index]
-    actions = len(fleet.action_low)
-    if isinstance(actor, GaussianActor) and (actor.features > width or len(actor.low) != actions):
+    shape, actions = _obs_shape(fleet, config), len(fleet.action_low)
+    config = dataclasses.replace(
+        config, hidden=hidden_layers(shape, config.hidden),
+        critic=dataclasses.replace(config.critic, hidden=hidden_layers(shape, config.critic.hidden)),
+    )  # fmt: skip
+    known = shape[0] if fleet.state is None else fleet.state.shape[1]
+    if isinstance(actor, GaussianActor) and (actor.features > known or len(actor.low) != actions):
         raise ContractError(
             f"the expert {config.expert} sees {actor.features} numbers and gives {len(actor.low)} actions, "
-            f"but {config.task} shows {width} and takes {actions}; train one with: tutelage train-expert {config.task}"
+            f"but {config.task} shows {known} and takes {actions}; train one with: tutelage train-expert {config.task}"
         )
     if isinstance(fleet, TaskFleet) and not fleet.goal_conditioned:
         if config.success_return is None and config.task in TASKS:  # once: a level that is not on the card is measured
@@ -129,13 +143,15 @@ def assemble(config: RunConfig) -> Assembly:
         if config.success_return is not None:
             fleet.success_return = config.success_return
     policy = EnsemblePolicy(
-        width, fleet.action_low, fleet.action_high,
+        shape, fleet.action_low, fleet.action_high,
         members=config.members, hidden=config.hidden, seed=derive(config.seed, "policy/initial weights"),
     )  # fmt: skip
-    dataset = AggregatedDataset((width,), actions, config.members, stream(config.seed, "dataset"), config.bootstrap)
+    dataset = AggregatedDataset(
+        shape, actions, config.members, stream(config.seed, "dataset"), config.bootstrap, stored_as(shape)
+    )
     scale = (policy.obs_mean, policy.obs_std, policy.action_middle, policy.action_half)
     critics = {
-        name: Critic(width, actions, "bad" if name == "risk" else "good", policy, config.critic, scale,
+        name: Critic(shape, actions, "bad" if name == "risk" else "good", policy, config.critic, scale,
                      stream(config.seed, f"critic/{name}"), derive(config.seed, f"critic/{name}/initial weights"))
         for name in sorted(priority.needs & {"risk", "goal"})
     }  # fmt: skip
@@ -149,6 +165,30 @@ def assemble(config: RunConfig) -> Assembly:
     return Assembly(config, fleet, actor, policy, learner)
 
 
+def fleet_of(config: RunConfig, num_envs: int, level: str | None, **settings: Any) -> Fleet:
+    """A fleet of the run's task at a level of disturbance, that observes what the run's policy sees.
+
+    Raises:
+        ConfigError: see `make_fleet`.
+    """
+    if config.observation != "state":  # a fleet of the user's own need not know the setting
+        settings["observation"] = config.observation
+    return make_fleet(config.task, num_envs, disturbance=level, threads=config.threads, **settings)
+
+
+def _obs_shape(fleet: Fleet, config: RunConfig) -> tuple[int, ...]:
+    """(D,) of vectors or (H, W, 3) of images.
+
+    Raises:
+        ConfigError: the fleet observes something else.
+    """
+    space = fleet.single_observation_space
+    shape = space.shape or ()
+    if len(shape) == 1 or (len(shape) == 3 and shape[2] == 3 and space.dtype == np.uint8):
+        return shape
+    raise ConfigError(f"a policy sees vectors or RGB images of bytes (H, W, 3), and {config.task} observes {space}")
+
+
 def _resolve_defaults(config: RunConfig) -> RunConfig:
     """Fill in what the task and the priority decide."""
     changes: dict[str, Any] = {}
@@ -158,7 +198,7 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
     if config.disturbance is None and task:
         changes["disturbance"] = task.disturbance
     if config.offline_pairs is None:
-        changes["offline_pairs"] = (task or Task).offline_pairs
+        changes["offline_pairs"] = getattr(found, "offline_pairs", Task.offline_pairs)
     if t.initial is None:
         initial = task.initial_period if task and config.priority.strip(".") == "C.U.R" else 0
         changes["thresholds"] = dataclasses.replace(t, initial=initial)

@@ -42,6 +42,7 @@ class RunConfig:
         disturbance: level of the world's disturbances; default: the task's own.
         success_return: the return that makes an episode of a task without a goal a success; default: 95 % of the expert's
             at this level.
+        observation: what the policy sees: "state", the task's vector, or "images", 64 x 64 RGB of the task's camera.
         offline_pairs: state-action pairs of the human before the run, in whole episodes of the supervisor; default:
             the task's own.
         offline_disturbance: level of disturbance while those were recorded (demonstrations are given in calm).
@@ -52,7 +53,7 @@ class RunConfig:
         learner: the update schedule.
         critic: of the risk and goal critics.
         members: networks in the ensemble.
-        hidden: widths of their hidden layers.
+        hidden: widths of their (fully connected) hidden layers; default: 256 256, for images 100 50 10.
         bootstrap: give each member its own bootstrap sample of the data.
         supervisor_noise: standard deviation of the humans' trembling, as a fraction of half the action range.
         expert: the algorithmic humans: a file of weights, or module:function that returns a policy; default: the weights
@@ -60,7 +61,7 @@ class RunConfig:
         overlap: learn while physics runs (the update at step t then sees the data up to t - 1).
         threads: physics threads; default: all cores, or with overlap all but one.
         torch_threads: threads of matrix products; default: all cores, at most 4, or with overlap 1.
-        out: run folder; default: runs/TASK-PRIORITY-sSEED.
+        out: run folder; default: runs/TASK-PRIORITY-sSEED, or runs/TASK-images-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.
         record: which frames to keep in episodes/: those under human control, all, or none.
@@ -78,6 +79,7 @@ class RunConfig:
     latency: int = 0
     disturbance: str | None = None
     success_return: float | None = None
+    observation: Literal["state", "images"] = "state"
     offline_pairs: int | None = None
     offline_disturbance: str = "none"
     calibration_steps: int = 200
@@ -86,7 +88,7 @@ class RunConfig:
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     critic: CriticConfig = field(default_factory=CriticConfig)
     members: int = 5
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] | None = None
     bootstrap: bool = True
     supervisor_noise: float = 0.0
     expert: str | None = None
@@ -110,15 +112,18 @@ class RunConfig:
             raise ConfigError(f"supervisor_noise must be a number >= 0, got {self.supervisor_noise}")
         if self.success_return is not None and not math.isfinite(self.success_return):
             raise ConfigError(f"success_return must be a number, got {self.success_return}")
-        if min(self.hidden, default=1) < 1:
-            raise ConfigError(f"hidden layers must be at least 1 wide, got {self.hidden}")
+        for hidden in (self.hidden, self.critic.hidden):
+            if min(hidden or (1,)) < 1:
+                raise ConfigError(f"hidden layers must be at least 1 wide, got {hidden}")
+        if self.observation not in ("state", "images"):
+            raise ConfigError(f"unknown observation {self.observation!r}: use state or images")
         if self.record not in ("human", "all", "none"):
             raise ConfigError(f"unknown record {self.record!r}: use human, all or none")
 
     @property
     def folder(self) -> Path:
         """Where the run is kept."""
-        task = self.task.replace(":", ".").replace("/", ".")
+        task = self.task.replace(":", ".").replace("/", ".") + ("-images" if self.observation == "images" else "")
         return self.out or Path("runs") / f"{task}-{self.priority.rstrip('.')}-s{self.seed}"
 
     @property

@@ -11,7 +11,7 @@ from typing import Any
 from tutelage.errors import ConfigError
 from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
-from tutelage.experiments.run import learner_state, read_config
+from tutelage.experiments.run import loop_state, read_config
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import Uncertainty, parse
 from tutelage.fleet.step import Subscriber
@@ -29,7 +29,7 @@ def evaluate_policy(
     priority: str = "C.",
     tally: Tally | None = None,
     subscribers: Sequence[Subscriber] = (),
-    learner: dict[str, Any] | None = None,
+    learned: dict[str, Any] | None = None,
 ) -> dict[str, float]:
     """Run a frozen policy for `config.steps` timesteps; returns the metrics.
 
@@ -40,7 +40,8 @@ def evaluate_policy(
             need a policy that has them.
         tally: where to count, for a display that watches it.
         subscribers: listeners, such as a progress display.
-        learner: the state of the run's learner, for priorities that look at its critics or its classifier.
+        learned: the state of the run's loop, for priorities that look at its critics or its classifier. If `priority` is
+            the run's own, it goes on with the thresholds that it had at the end of the run.
 
     Raises:
         ConfigError: the priority looks at something that this run has not learned.
@@ -54,14 +55,16 @@ def evaluate_policy(
     wanted = LEARNED & asked.needs
     if wanted and policy is not None:
         try:
-            assembly.learner.load_state_dict(learner or {})
+            assembly.learner.load_state_dict((learned or {})["learner"])
         except KeyError:
             raise ConfigError(
                 f"this run did not learn {', '.join(sorted(wanted))}, which {priority} looks at; evaluate it with "
                 f"{config.priority}, U.C. or C."
             ) from None
     tally = tally or Tally(config.robots, config.humans)
-    loop = assembly.loop(frozen=assembly.actor if policy is None else policy)
+    loop = assembly.loop(frozen=assembly.human if policy is None else policy)
+    if learned and priority == config.priority:
+        loop.priority.load_state_dict(learned["priority"])
     loop.subscribers = [Counting(tally), *subscribers]
     loop.run(config.steps)
     assembly.fleet.close()
@@ -83,8 +86,9 @@ def evaluate_run(
     """
     config = dataclasses.replace(read_config(folder), steps=steps)
     policy = None if expert else EnsemblePolicy.load(folder / "policy.safetensors")[0]
-    learner = learner_state(folder) if LEARNED & parse(priority, gate=config.gate).needs and not expert else None
-    metrics = evaluate_policy(config, policy, priority, tally, subscribers, learner)
+    remembers = priority == config.priority or LEARNED & parse(priority, gate=config.gate).needs
+    learned = loop_state(folder) if remembers and not expert else None
+    metrics = evaluate_policy(config, policy, priority, tally, subscribers, learned)
     result = {"steps": steps, "priority": priority, "policy": "expert" if expert else "run", **metrics}
     write_atomic(evaluation_path(folder, expert), json.dumps(result, indent=2).encode())
     return result

@@ -9,7 +9,6 @@ The tasks have their own level of disturbance, and demonstrations are given in c
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tutelage.envs import experts
-from tutelage.errors import ConfigError, MissingExtraError, RunFolderError
+from tutelage.errors import ConfigError, MissingExtraError
 from tutelage.experiments import plots
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.jobs import Job, resolved, run_jobs, slug, start_or_resume
@@ -161,14 +160,15 @@ def reproduce(config: Figure23Config) -> str:
 
 
 def _job(config: Figure23Config, task: str, algorithm: str, seed: int, more_pairs: int = 0) -> Job:
-    scale, name = "full" if config.full else "small", f"{slug(algorithm)}-s{seed}"
-    run = dataclasses.replace(
-        configuration(task, algorithm, config.full, more_pairs), seed=seed, out=config.out / scale / task / name
-    )
-    return Job(f"{task} {algorithm} seed {seed}", one, (run,), config.results / task / f"{name}.json", _summary)
+    name = f"{slug(algorithm)}-s{seed}"
+    place = config.out / ("full" if config.full else "small") / task
+    folder = f"{slug(algorithm)}-{more_pairs}-s{seed}" if more_pairs else name  # with more seeds come other numbers of pairs
+    run = dataclasses.replace(configuration(task, algorithm, config.full, more_pairs), seed=seed, out=place / folder)
+    return Job(f"{task} {algorithm} seed {seed}", one, (run,), config.results / task / f"{name}.json", summary)
 
 
-def _summary(result: dict[str, Any]) -> str:
+def summary(result: dict[str, Any]) -> str:
+    """One line about the result of `one`."""
     last = result["epochs"][-1]
     return (
         f"return {last['return_mean'] / result['expert_return']:.2f} of the expert's, "
@@ -186,28 +186,25 @@ def last(results: list[dict[str, Any]], task: str, algorithm: str, name: str) ->
     return np.array([r["epochs"][-1][name] / (r["expert_return"] if name == "return_mean" else 1) for r in mine])
 
 
-def read(folder: Path) -> list[dict[str, Any]]:
-    """The small result files below a folder.
+def present(results: list[dict[str, Any]]) -> list[str]:
+    """The tasks that have results, in the order of the figure."""
+    return [task for task in SETTINGS if any(r["task"] == task for r in results)]
 
-    Raises:
-        RunFolderError: a damaged file.
-    """
-    try:
-        return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/*.json"))]
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"a result file in {folder} is damaged: {error}") from None
+
+def scale(results: list[dict[str, Any]]) -> str:
+    """How large the runs were, in words."""
+    every = results[0]["config"]["learner"]["every"]
+    return (
+        "published scale" if every == 5000 else f"small scale: {len(results[0]['epochs']) - 1} epochs of {every:,} timesteps"
+    )
 
 
 def table(results: list[dict[str, Any]]) -> str:
     """Published and ours side by side, as Markdown."""
-    tasks = [task for task in SETTINGS if any(r["task"] == task for r in results)]
-    every = results[0]["config"]["learner"]["every"]
-    scale = (
-        "published scale" if every == 5000 else f"small scale: {len(results[0]['epochs']) - 1} epochs of {every:,} timesteps"
-    )
+    tasks = present(results)
     lines = [
-        f"Figure 2.3, {scale}, {len({r['seed'] for r in results})} seeds, mean ± 95 % interval over seeds. Return: of ten "
-        "test rollouts after the last epoch, as a fraction of the expert's.",
+        f"Figure 2.3, {scale(results)}, {len({r['seed'] for r in results})} seeds, mean ± 95 % interval over seeds. Return: "
+        "of ten test rollouts after the last epoch, as a fraction of the expert's.",
         "",
         "| Task | Algorithm | Return ↑ | Supervisor actions ↓ | Context switches ↓ |",
         "| --- | --- | ---: | ---: | ---: |",
@@ -216,7 +213,7 @@ def table(results: list[dict[str, Any]]) -> str:
         for name in ALGORITHMS:
             cells = [last(results, task, name, k) for k in ("return_mean", "supervisor_actions", "context_switches")]
             if len(cells[0]):
-                shown = [_interval(cells[0], 2), _interval(cells[1], 0), _interval(cells[2], 0)]
+                shown = [plots.interval(values, digits) for values, digits in zip(cells, (2, 0, 0), strict=True)]
                 lines.append(f"| {task} | {name} | {' | '.join(shown)} |")
     lines += [
         "",
@@ -235,14 +232,6 @@ def table(results: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _interval(values: Any, digits: int) -> str:
-    mean = f"{values.mean():,.{digits}f}"
-    if len(values) < 2:
-        return mean
-    half = plots.t95(len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
-    return f"{mean} ± {half:,.{digits}f}"
-
-
 def figure(results: list[dict[str, Any]]) -> Figure:
     """Columns (A) to (D) of figure 2.3, a row for each task: mean and 95 % band over seeds.
 
@@ -254,7 +243,7 @@ def figure(results: list[dict[str, Any]]) -> Figure:
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtraError("matplotlib", "report") from None
-    tasks = [task for task in SETTINGS if any(r["task"] == task for r in results)]
+    tasks = present(results)
     rivals, ablations = (LAZY, SAFE, "DAgger", BC), (LAZY, *ALGORITHMS[4:])
     columns = (
         ("A: return / expert's", "return_mean", rivals), ("B: return / expert's", "return_mean", ablations),

@@ -63,6 +63,21 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> list[dict[str, Any]]:
     return [results[k] for k in range(len(jobs))]
 
 
+def read_results(folder: Path) -> list[dict[str, Any]]:
+    """The small result files below a folder, in the order of their names.
+
+    Raises:
+        RunFolderError: a damaged file.
+    """
+    results = []
+    for path in sorted(folder.rglob("*.json")):
+        try:
+            results.append(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise RunFolderError(f"the result file {path} is damaged: {error}") from None
+    return results
+
+
 def start_or_resume(config: RunConfig) -> Run:
     """The run of a configuration: a new one, or the one in its folder.
 

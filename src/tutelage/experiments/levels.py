@@ -12,6 +12,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 from tyro.conf import Positional
@@ -22,6 +23,8 @@ from tutelage.envs.tasks import TASKS
 from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.prepare import prepare
+from tutelage.experiments.table_3 import SETTINGS
+from tutelage.learning.imitation import LearnerConfig
 from tutelage.seeding import derive
 from tutelage.store import write_atomic
 
@@ -34,6 +37,7 @@ class LevelsConfig:
         task: name of a task.
         levels: levels of disturbance; default: the task's own.
         offline_pairs: state-action pairs that are cloned; default: the task's own.
+        observation: what is cloned from: "state" or "images", the latter as in table 3.3.
         episodes: robots, one episode each.
         seed: root seed; one that no comparison uses.
         threads: physics threads.
@@ -43,6 +47,7 @@ class LevelsConfig:
     task: Positional[str]
     levels: tuple[str, ...] = ()
     offline_pairs: int | None = None
+    observation: Literal["state", "images"] = "state"
     episodes: int = 100
     seed: int = 100
     threads: int | None = None
@@ -61,9 +66,12 @@ def suits(expert_success: float, cloned_success: float) -> bool:
 
 def behaviour_cloning(config: LevelsConfig, level: str) -> dict[str, float]:
     """Success and survival of the policy with which a run begins, over one episode on each robot."""
+    learner = SETTINGS["table-3.3"].learner if config.observation == "images" else LearnerConfig()
     run = RunConfig(
         config.task,
         priority="C.",
+        observation=config.observation,
+        learner=learner,
         disturbance=level,
         offline_pairs=config.offline_pairs,
         robots=config.episodes,
@@ -98,6 +106,7 @@ def measure(config: LevelsConfig) -> list[dict[str, object]]:
                 "bc_success": cloned["success"],
                 "bc_survived": cloned["survived"],
                 "offline_pairs": pairs,
+                **({"observation": "images"} if config.observation == "images" else {}),
                 "episodes": config.episodes,
                 "seed": config.seed,
                 "suits": fits,
@@ -117,7 +126,7 @@ def main(args: Sequence[str] | None = None) -> None:
     config = tyro.cli(LevelsConfig, args=args, description=__doc__)
     known = json.loads(config.results.read_text()) if config.results.exists() else {}
     new = measure(config)
-    rows = {(row["level"], row["offline_pairs"]): row for row in [*known.get(config.task, []), *new]}
+    rows = {(row["level"], row["offline_pairs"], row.get("observation")): row for row in [*known.get(config.task, []), *new]}
     known[config.task] = list(rows.values())
     write_atomic(config.results, (json.dumps(known, indent=1, sort_keys=True) + "\n").encode())
 

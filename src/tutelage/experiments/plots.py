@@ -76,6 +76,12 @@ def mean_ci(values: Array) -> tuple[Array, Array]:
     return mean, t95(n - 1) * np.std(values, axis=0, ddof=1) / math.sqrt(n)
 
 
+def interval(values: Array, digits: int = 0) -> str:
+    """Mean and half width of its 95 % confidence interval over runs (n,), such as "0.98 ± 0.03"; one run has no width."""
+    mean, half = mean_ci(values)
+    return f"{mean:,.{digits}f}" + (f" ± {half:,.{digits}f}" if len(values) > 1 else "")
+
+
 def by_label(runs: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
     """The runs of each algorithm, in the order of their first appearance."""
     groups: dict[str, list[RunRecord]] = {}

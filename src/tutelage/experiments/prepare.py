@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.envs.registry import make_fleet
 from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError
-from tutelage.experiments.assemble import Assembly
+from tutelage.experiments.assemble import Assembly, fleet_of
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.conformal import miss_threshold
 from tutelage.fleet.discrepancy import discrepancy
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.policy import Policy
 from tutelage.fleet.priority import parse
+from tutelage.fleet.supervisor import PolicySupervisor
 from tutelage.policies.kinds import kinds_of
 from tutelage.seeding import derive, stream
 
@@ -33,7 +33,8 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
     """Demonstrate, clone, calibrate; returns the assembly with resolved thresholds."""
     c, learner, policy = assembly.config, assembly.learner, assembly.policy
     report("recording demonstrations", 0.0)
-    obs, actions = demonstrations(c, assembly.actor, assembly.fleet.horizon)
+    shown = demonstrations(c, assembly.actor, assembly.fleet.horizon)
+    obs, actions = shown.obs, shown.actions
     policy.set_normalisation(obs)
     held_out = np.zeros(len(obs), dtype=bool)
     if learner.classifier:  # 70 % for the policy, 30 % for the classifier (appendix A.1)
@@ -52,6 +53,8 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
         _in_steps(c.learner.pretrain, learner.classifier.updates, "discrepancy classifier", report)
     if needs & {"uncertainty", "risk", "goal"}:
         signals = _calibrate(assembly, report)
+        if goal := learner.critics.get("goal"):  # eq. 3.6 is over D_r and D_h; a risk critic would learn nothing from calm
+            goal.add(obs, actions, shown.next_obs, shown.success, end=shown.success)
         for name, critic in learner.critics.items():
             _in_steps(c.critic.pretrain, critic.updates, f"{name} critic", report)
             signals[name] = np.concatenate([critic(o, a) for o, a in signals["visited"]])
@@ -63,8 +66,20 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
     return dataclasses.replace(assembly, config=c)
 
 
-def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Array, Array]:
-    """Offline data of the human: obs (n, D) float32, actions (n, A). Whole episodes, one a robot; falls are left out.
+class Demonstrations(NamedTuple):
+    """n transitions of the human: obs, next_obs (n, D) float32 or (n, H, W, 3) uint8, actions (n, A), success (n,) bool.
+
+    Success: the goal was reached in this step.
+    """
+
+    obs: Array
+    actions: Array
+    next_obs: Array
+    success: Array
+
+
+def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> Demonstrations:
+    """Offline data of the human, as many pairs as `config` says. Whole episodes, one a robot; falls are left out.
 
     Where there is a goal an episode ends with it, those that do not reach it are left out too, and robots demonstrate again
     until there are pairs enough.
@@ -76,37 +91,40 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> tuple[Arra
     spare += -spare % len(kinds_of(actor))  # as many of one kind of human as of the other
     # A fleet of the user's own need not know levels; a run on one that does has a level by now.
     level = None if config.disturbance is None else config.offline_disturbance
-    fleet = make_fleet(config.task, spare, disturbance=level, threads=config.threads)
-    goal = fleet.goal_conditioned
+    fleet = fleet_of(config, spare, level)
+    human, goal = PolicySupervisor(actor, fleet), fleet.goal_conditioned
     seed: int | None = derive(config.seed, "demonstrations") % 2**32
-    pairs: list[tuple[Array, Array]] = []
-    while sum(len(seen) for seen, _ in pairs) < wanted:
+    episodes_of: list[Demonstrations] = []
+    while sum(len(part.obs) for part in episodes_of) < wanted:
         obs, _ = fleet.reset(seed=seed)
-        seen, done, ends, failed = _episodes(fleet, actor, obs, horizon if goal else length)
+        seen, done, after, ends, failed = _episodes(fleet, human, obs, horizon if goal else length)
         good = np.flatnonzero(~failed)
         if len(good) < (1 if goal else episodes):
             what = "did not reach the goal" if goal else "fell"
             raise ConfigError(f"the expert {what} in {int(failed.sum())} of {spare} demonstrations; choose a calmer level")
         good = good if goal else good[:episodes]
-        pairs += [(seen[: ends[robot], robot], done[: ends[robot], robot]) for robot in good]
+        for robot in good:
+            end = ends[robot]
+            reached = np.arange(1, end + 1) == end if goal else np.zeros(end, dtype=bool)
+            episodes_of.append(Demonstrations(seen[:end, robot], done[:end, robot], after[:end, robot], reached))
         seed = None
     fleet.close()
-    all_seen, all_done = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    return all_seen[:wanted], all_done[:wanted]
+    return Demonstrations(*(np.concatenate(part)[:wanted] for part in zip(*episodes_of, strict=True)))
 
 
-def _episodes(fleet: Fleet, actor: Policy, obs: Array, length: int) -> tuple[Array, Array, Array, Array]:
+def _episodes(fleet: Fleet, human: Policy, obs: Array, length: int) -> tuple[Array, Array, Array, Array, Array]:
     """One episode of the human on each robot, from `obs`, of at most so many timesteps.
 
     Returns:
-        obs (T, N, D) float32, actions (T, N, A), the timesteps of each robot (N,), and whether it failed (N,).
+        obs (T, N, D) float32 or (T, N, H, W, 3) uint8, actions (T, N, A), next_obs like obs, the timesteps of each robot
+        (N,), and whether it failed (N,).
     """
     ends = np.full(fleet.num_envs, length)
     complete = np.zeros(fleet.num_envs, dtype=bool)
     seen, done = [], []
     for t in range(length):
-        action = actor.act(obs)
-        seen.append(obs.astype(np.float32))
+        action = human.act(obs)
+        seen.append(obs)
         done.append(action)
         obs, _, _, _, info = fleet.step(action)
         if fleet.goal_conditioned:
@@ -115,7 +133,10 @@ def _episodes(fleet: Fleet, actor: Policy, obs: Array, length: int) -> tuple[Arr
             if (complete | info["violation"]).all():
                 break
     failed = ~complete if fleet.goal_conditioned else info["violation"]
-    return np.stack(seen), np.stack(done), ends, failed
+    states = np.stack([*seen, obs])
+    if states.dtype != np.uint8:  # images are kept as bytes
+        states = states.astype(np.float32)
+    return states[:-1], np.stack(done), states[1:], ends, failed
 
 
 def _calibrate(assembly: Assembly, report: Report) -> dict[str, Any]:

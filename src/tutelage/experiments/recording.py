@@ -105,10 +105,14 @@ class MetricsFile:
 class EpisodeFrames:
     """`episodes/*.parquet`: frames in the field's names, one file between two checkpoints.
 
-    Columns: timestep, robot, episode_index, frame_index, observation.state, action (executed), action.proposed (by the
-    policy), action.wanted (by the human; the executed one where none acted), next.reward, next.success, next.violation,
-    intervention (bool), operator (human, -1 for none), policy_version (number of timesteps the policy has learned from).
+    Columns: timestep, robot, episode_index, frame_index, observation.state or observation.images.camera, action (executed),
+    action.proposed (by the policy), action.wanted (by the human; the executed one where none acted), next.reward,
+    next.success, next.violation, intervention (bool), operator (human, -1 for none), policy_version (number of timesteps the
+    policy has learned from). An image is a tensor (H, W, 3) uint8.
     """
+
+    ROOM = 2**26
+    """Bytes of frames that are kept as they are; beyond that they are compressed in memory until the next commit."""
 
     def __init__(self, folder: Path, which: str, robots: int) -> None:
         try:
@@ -117,8 +121,9 @@ class EpisodeFrames:
             raise MissingExtraError("pyarrow", "data") from None
         self._folder, self._which = folder, which
         folder.mkdir(exist_ok=True)
-        self._start = 0
+        self._start = self._bytes = 0
         self._columns: dict[str, list[Any]] = {}
+        self._file: Any = None
         self.episode = np.arange(robots)
         self.frame = np.zeros(robots, dtype=np.int64)
 
@@ -129,12 +134,14 @@ class EpisodeFrames:
         keep = human if self._which == "human" else moving
         (robots,) = np.nonzero(keep)
         if robots.size:
+            seen = step.obs[robots]
+            images = seen.dtype == np.uint8
             columns = {
                 "timestep": np.full(robots.size, step.t),
                 "robot": robots,
                 "episode_index": self.episode[robots],
                 "frame_index": self.frame[robots],
-                "observation.state": step.obs[robots].astype(np.float32),
+                "observation.images.camera" if images else "observation.state": seen if images else seen.astype(np.float32),
                 "action": step.actions[robots],
                 "action.proposed": step.proposed[robots].astype(np.float32),
                 "action.wanted": np.where(human[:, None], step.wanted, step.actions)[robots],
@@ -147,6 +154,9 @@ class EpisodeFrames:
             }
             for name, column in columns.items():
                 self._columns.setdefault(name, []).append(column)
+                self._bytes += column.nbytes
+            if self._bytes > self.ROOM:
+                self._compress()
         self.frame[moving] += 1
         ended = moving & (step.violation | step.success | step.truncated)
         self.frame[ended] = 0
@@ -154,20 +164,25 @@ class EpisodeFrames:
 
     def commit(self, t: int) -> None:
         """Write the frames since the last commit as one durable file."""
+        if self._columns:
+            self._compress()
+        if self._file:
+            content, writer = self._file
+            writer.close()
+            write_atomic(self._folder / f"steps-{self._start:08d}-{t:08d}.parquet", content.getvalue().to_pybytes())
+        self._file, self._start = None, t
+
+    def _compress(self) -> None:
+        """Append the frames at hand to the file that is being made in memory."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        if self._columns:
-            whole = {name: np.concatenate(parts) for name, parts in self._columns.items()}
-            arrays = {
-                name: pa.array(v) if v.ndim == 1 else pa.FixedSizeListArray.from_arrays(pa.array(v.ravel()), v.shape[1])
-                for name, v in whole.items()
-            }
-            path = self._folder / f"steps-{self._start:08d}-{t:08d}.parquet"
+        table = pa.table({name: _arrow(np.concatenate(parts)) for name, parts in self._columns.items()})
+        if self._file is None:
             content = pa.BufferOutputStream()
-            pq.write_table(pa.table(arrays), content)
-            write_atomic(path, content.getvalue().to_pybytes())
-        self._columns, self._start = {}, t
+            self._file = content, pq.ParquetWriter(content, table.schema, compression="zstd")
+        self._file[1].write_table(table)
+        self._columns, self._bytes = {}, 0
 
     def cut(self, t: int) -> None:
         """Drop the files of timestep t and later ones."""
@@ -183,6 +198,17 @@ class EpisodeFrames:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.episode, self.frame = state["episode"].copy(), state["frame"].copy()
+
+
+def _arrow(values: Any) -> Any:
+    """A column (n,), (n, width) or of images (n, H, W, 3) as an Arrow array."""
+    import pyarrow as pa
+
+    if values.ndim == 1:
+        return pa.array(values)
+    if values.ndim == 2:
+        return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+    return pa.FixedShapeTensorArray.from_numpy_ndarray(values)
 
 
 class Recorder:

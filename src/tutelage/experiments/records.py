@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.errors import ContractError, RunFolderError
+from tutelage.fleet.attempts import attempts, request_rate
 from tutelage.fleet.events import Events
 from tutelage.fleet.metrics import EventLog, intervention_lengths, summary
 
@@ -64,6 +65,12 @@ class RunRecord:
         values = {name: float(column[-1]) for name, column in self.metrics.items() if not name.startswith("loss/")}
         lengths = intervention_lengths(self.log)
         values["intervention_length"] = float(np.median(lengths)) if len(lengths) else math.nan
+        values["request_rate"] = request_rate(self.log)
+        tried = attempts(self.log)
+        if len(tried.robot):
+            values["episode/interventions"] = float(tried.interventions.mean())
+            values["episode/human_actions"] = float(tried.human_actions.mean())
+            values["episode/robot_actions"] = float(tried.robot_actions.mean())
         return values | {f"evaluation/{name}": value for name, value in self.evaluation.items()}
 
     @cached_property

@@ -1,10 +1,12 @@
-"""`tutelage reproduce`: which figure is made by which experiment, at which scale."""
+"""`tutelage reproduce`: which figure or table is made by which experiment, at which scale."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from tutelage.experiments import figure_2_3
+from tutelage.errors import ConfigError
+from tutelage.experiments import figure_2_3, figure_a_1, gates_table, table_3
 from tutelage.experiments.study import StudyConfig, run_study
 from tutelage.experiments.tables import tables
 
@@ -15,21 +17,38 @@ def reproduce(
     """Run what is missing of a figure; returns the tables, published and ours, as Markdown.
 
     Args:
-        what: "figure-2.3", "figure-5.3" or "figure-C.1".
+        what: "figure-2.3", "figure-A.1", "table-3.1", "table-3.3", "gates", "figure-5.3" or "figure-C.1".
         tasks: which tasks; empty: those of the figure.
         seeds: root seeds; empty: the figure's own number of them.
-        full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000, figure-C.1 3,000.
+        full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000, figure-C.1 3,000; `gates`, which
+            nobody published, 2,000 in place of 10,000; table-3.3 has 3 seeds and trains its networks on instead of anew;
+            table-3.1 has the published scale in any case.
         workers: runs side by side.
         out: folder of the run folders.
         results: folder of the small result files; the experiment has its own folder in it.
+
+    Raises:
+        ConfigError: a task that the figure does not have.
+        TutelageError: a run failed.
     """
+    chosen: dict[str, Any] = {"tasks": tasks, "seeds": seeds}
+    given = {name: value for name, value in chosen.items() if value}
+    given |= {"workers": workers, "out": out, "results": results / "single" / what}
     if what == "figure-2.3":
-        chosen = {"tasks": tasks, "seeds": seeds}
-        given = {name: value for name, value in chosen.items() if value}
-        config = figure_2_3.Figure23Config(
-            **given, full=full, workers=workers, out=out, results=results / "single" / what  # type: ignore[arg-type]
-        )  # fmt: skip
-        return figure_2_3.reproduce(config)
+        return figure_2_3.reproduce(figure_2_3.Figure23Config(full=full, **given))
+    if what == "figure-A.1":
+        return figure_a_1.reproduce(figure_a_1.FigureA1Config(full=full, **given))
+    if what == "gates":
+        each = given.pop("tasks", (gates_table.GatesConfig.task,))
+        steps = 10_000 if full else gates_table.GatesConfig.steps
+        return "\n".join(gates_table.reproduce(gates_table.GatesConfig(task, steps=steps, **given)) for task in each)
+    if what in table_3.SETTINGS:
+        if tasks not in ((), (table_3.SETTINGS[what].task,)):
+            raise ConfigError(f"{what} is about {table_3.SETTINGS[what].task}; leave out --tasks")
+        given.pop("tasks", None)
+        if not full:
+            given.setdefault("seeds", tuple(range(table_3.SETTINGS[what].seeds)))
+        return table_3.reproduce(table_3.Table3Config(what, full=full, **given))
     ablations = what == "figure-C.1"
     small, evaluate = (3000, 0) if ablations else (2000, 1000)
     for task in tasks or (("Walker2d",) if ablations else ("Walker2d", "Ant", "Humanoid")):

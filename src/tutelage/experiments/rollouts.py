@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tutelage.envs.registry import make_fleet
 from tutelage.envs.rollout import rollout
 from tutelage.envs.task_fleet import TaskFleet
+from tutelage.experiments.assemble import fleet_of
 from tutelage.experiments.config import RunConfig
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.step import Step
@@ -51,7 +51,7 @@ class TestRollouts:
     def _score(self, loop: Loop, seed: int) -> dict[str, float]:
         c = self.config
         rule = {"success_return": loop.fleet.success_return} if isinstance(loop.fleet, TaskFleet) else {}
-        fleet = make_fleet(c.task, self.episodes, disturbance=c.disturbance, threads=c.threads, **rule)
+        fleet = fleet_of(c, self.episodes, c.disturbance, **rule)
         episodes = rollout(fleet, loop.policy, seed)
         fleet.close()
         return {

@@ -174,8 +174,8 @@ def read_config(folder: Path) -> RunConfig:
     return from_json(RunConfig, values)  # type: ignore[no-any-return]
 
 
-def learner_state(folder: Path) -> dict[str, Any]:
-    """What the learner of a run knew at its last checkpoint.
+def loop_state(folder: Path) -> dict[str, Any]:
+    """The state of a run's loop at its last checkpoint: what its learner and its priority had learned, and all else.
 
     Raises:
         RunFolderError: a damaged checkpoint, or one of another version.
@@ -187,7 +187,7 @@ def learner_state(folder: Path) -> dict[str, Any]:
             f"{path} has format {state.get('format')}, this version reads {FORMAT}; use the version that wrote it"
         )
     try:
-        return dict(state["loop"]["learner"])
+        return dict(state["loop"])
     except (LookupError, TypeError):
         raise RunFolderError(f"{path} is damaged; restore it") from None
 

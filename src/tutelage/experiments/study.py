@@ -169,17 +169,19 @@ def run_study(study: StudyConfig) -> list[dict[str, Any]]:
     reference = run_jobs(_jobs(study, configurations(study, None)), study.workers)
     human_time = float(np.mean([r["metrics"]["human_time"] for r in reference]))
     print(f"C.U.R. solicited {human_time:,.0f} human timesteps on average", flush=True)
-    return reference + run_jobs(_jobs(study, configurations(study, human_time)), study.workers)
+    return reference + run_jobs(_jobs(study, configurations(study, human_time), round(human_time)), study.workers)
 
 
-def _jobs(study: StudyConfig, configs: dict[str, RunConfig]) -> list[Job]:
+def _jobs(study: StudyConfig, configs: dict[str, RunConfig], human_time: int = 0) -> list[Job]:
+    """human_time: T_h, if the configurations depend on it; with more seeds comes another one, and other runs."""
     jobs = []
     kind = "ablations" if study.ablations else "comparison"
     for seed in study.seeds:
         for name, config in configs.items():
             # C.U.R. is the same run in the comparison and among the ablations of equal length.
             place = study.out / f"{study.task}-{study.robots}x{study.humans}-{study.steps}"
-            config = dataclasses.replace(config, seed=seed, out=place / f"{slug(name)}-s{seed}")
+            budget = f"-{human_time}" if name in (BEHAVIOUR_CLONING, "Random") else ""
+            config = dataclasses.replace(config, seed=seed, out=place / f"{slug(name)}{budget}-s{seed}")
             file = study.results / kind / study.task / f"{slug(name)}-s{seed}.json"
             expert = name == "C.U.R." and not study.ablations
             jobs.append(Job(f"{study.task} {name} seed {seed}", one, (config, study.evaluate, expert), file, _summary))

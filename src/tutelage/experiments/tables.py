@@ -4,7 +4,7 @@
     python -m tutelage.experiments.tables results/fleet --check    # exit 1 if the page does not say what the files say
 
 Only what stands between `<!-- begin: NAME -->` and `<!-- end: NAME -->` is rewritten: `tables` in results.md, and `levels`
-in tasks.md from results/levels.json, and `figure 2.3` in results-single.md where results/single/figure-2.3 exists.
+in tasks.md from results/levels.json, and each of results/single/ in results-single.md under the name of its folder.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,9 @@ from tyro.conf import Positional
 
 from tutelage.envs.tasks import TASKS
 from tutelage.errors import RunFolderError, TutelageError
-from tutelage.experiments import figure_2_3, plots
+from tutelage.experiments import figure_2_3, figure_a_1, gates_table, plots, table_3
 from tutelage.experiments.figures import figure, figure_name
+from tutelage.experiments.jobs import read_results
 from tutelage.experiments.levels import suits
 from tutelage.experiments.relations import Relation, ablation_relations, relations
 from tutelage.experiments.results import FROZEN, ONLINE, OURS, Column, Groups, in_order, read
@@ -39,6 +40,13 @@ PUBLISHED: dict[str, dict[str, tuple[str, str, str]]] = {
     }
 }
 """Table C.2 of the dissertation: successes, hard resets and idle time of the frozen policies."""
+SINGLE: dict[str, Callable[[list[dict[str, Any]]], str]] = {
+    "figure-2.3": figure_2_3.table,
+    "figure-A.1": figure_a_1.table,
+    **{name: functools.partial(table_3.table, name) for name in table_3.SETTINGS},
+    "gates": gates_table.table,
+}
+"""What results/single/ holds and docs/results-single.md shows, and how."""
 
 
 # -- tables ---------------------------------------------------------------------------------------------------------------
@@ -215,6 +223,7 @@ def _level(task: str, level: dict[str, Any]) -> list[str]:
     fits = "yes" if suits(expert, cloned) else "no"
     name = f"**{level['level']}**" if level.get("chosen") else str(level["level"])
     pairs = f"{level['offline_pairs']:,}" if "offline_pairs" in level else ""
+    task = f"{task}, from images" if level.get("observation") == "images" else task
     return [task, name, pairs, f"{expert:.0%}", f"{cloned:.0%}", str(level["episodes"]), fits]
 
 
@@ -248,17 +257,19 @@ class TablesConfig:
 
 def run(config: TablesConfig) -> list[Path]:
     """Rewrite the pages and draw the figures; returns the files that were, or with `check` should be, written."""
-    parts = {
-        config.docs / "results.md": ("tables", tables(config.results)),
-        config.docs / "tasks.md": ("levels", levels(config.results.parent / "levels.json")),
+    found = {name: read_results(config.results.parent / "single" / name) for name in SINGLE}
+    pages: dict[str, dict[str, str]] = {
+        "results.md": {"tables": tables(config.results)},
+        "tasks.md": {"levels": levels(config.results.parent / "levels.json")},
+        "results-single.md": {name: SINGLE[name](results) for name, results in found.items() if results},
     }
-    single = config.results.parent / "single" / "figure-2.3"
-    if single.exists():
-        parts[config.docs / "results-single.md"] = ("figure 2.3", figure_2_3.table(figure_2_3.read(single)))
     stale = []
-    for path, (name, content) in parts.items():
+    for file, parts in pages.items():
+        path = config.docs / file
+        if not parts:
+            continue
         page = path.read_text(encoding="utf-8")
-        wanted = insert(page, name, content)
+        wanted = functools.reduce(lambda text, part: insert(text, *part), parts.items(), page)
         if wanted != page:
             stale.append(path)
             if not config.check:
@@ -268,8 +279,9 @@ def run(config: TablesConfig) -> list[Path]:
         for kind in ("comparison", "ablations")
         for task, groups in read(config.results, kind).items()
     }
-    if single.exists():
-        draw["figure-2.3.png"] = functools.partial(figure_2_3.figure, figure_2_3.read(single))
+    for name, paint in (("figure-2.3", figure_2_3.figure), ("figure-A.1", figure_a_1.figure)):
+        if found[name]:
+            draw[f"{name}.png"] = functools.partial(paint, found[name])
     for name, make in draw.items():
         path = config.docs / "images" / name
         if not config.check:

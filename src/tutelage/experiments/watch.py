@@ -86,7 +86,10 @@ def watch(config: WatchConfig) -> Path:
     """
     sheet = config.path.suffix == ".png"
     policy = EnsemblePolicy.load(config.run / "policy.safetensors")[0] if config.run else experts.load(config.task)[0]
-    fleet = make_fleet(config.task, 1 if sheet else config.robots, disturbance=config.disturbance)
+    settings: dict[str, Any] = (
+        {"observation": "images"} if isinstance(policy, EnsemblePolicy) and len(policy.obs_shape) == 3 else {}
+    )
+    fleet = make_fleet(config.task, 1 if sheet else config.robots, disturbance=config.disturbance, **settings)
     if not hasattr(fleet, "render_robot"):
         raise ConfigError(f"{config.task} draws no pictures")
     seed = derive(config.seed, "watch") % 2**32

@@ -44,6 +44,14 @@ class Fleet(VectorEnv[Any, Any, Any]):
     goal_conditioned: bool = False
     """Whether success means reaching a goal state (the goal critic and U.G.C. need one)."""
 
+    @property
+    def state(self) -> Array | None:
+        """What there is to know of all robots now, (N, D), where they observe something else, such as images; else None.
+
+        For humans who are programs: nobody else looks at it.
+        """
+        return None
+
     @abstractmethod
     def step_async(self, actions: Array, active: Mask | None = None) -> None:
         """Start one timestep of the robots in `active` (all by default)."""

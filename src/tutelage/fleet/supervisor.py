@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.errors import ConfigError, ContractError
+from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.policy import Policy
 from tutelage.seeding import rng_state, set_rng_state
 
@@ -25,12 +26,22 @@ class Supervisor(Protocol):
 
 
 class PolicySupervisor:
-    """An algorithmic human: acts as a fully trained policy (section 5.6)."""
+    """An algorithmic human: acts as a fully trained policy (section 5.6).
 
-    def __init__(self, policy: Policy) -> None:
-        self.policy = policy
+    Args:
+        policy: how they act.
+        fleet: whose robots they help. Where these observe images, the human acts on the state of the fleet, in which a
+            program finds what a person sees in a picture.
+    """
 
-    def act(self, obs: Array, robots: Array) -> Array:
+    def __init__(self, policy: Policy, fleet: Fleet | None = None) -> None:
+        self.policy, self.fleet = policy, fleet
+
+    def act(self, obs: Array, robots: Array | None = None) -> Array:
+        """The human's actions for the robots that show obs (n, ...): indices (n,), by default the whole fleet. (n, A)."""
+        state = None if self.fleet is None else self.fleet.state
+        if state is not None:
+            obs = state if robots is None else state[robots]
         return self.policy.act(obs)
 
 

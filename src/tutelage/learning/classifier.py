@@ -13,7 +13,7 @@ from tutelage.fleet.discrepancy import discrepancy
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.ensemble import EnsemblePolicy
-from tutelage.policies.mlp import BatchedMLP
+from tutelage.policies.networks import as_tensor, hidden_layers, network, stored_as
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import rng_state, set_rng_state
 
@@ -32,7 +32,7 @@ class DiscrepancyClassifier:
         beta_h: beta_H, as a fraction of the largest discrepancy; set it before training.
         batch: pairs in a gradient step.
         learning_rate: of Adam.
-        hidden: widths of the hidden layers (appendix A.1).
+        hidden: widths of the hidden layers; default: 128 and 128 (appendix A.1), for images those of the policy.
         rng: the seeded stream of batches; seed: of the initial weights.
     """
 
@@ -46,18 +46,18 @@ class DiscrepancyClassifier:
         beta_h: float = np.nan,
         batch: int = 256,
         learning_rate: float = 1e-3,
-        hidden: tuple[int, ...] = (128, 128),
+        hidden: tuple[int, ...] | None = None,
     ) -> None:
         self.policy, self.dataset, self.rng, self.beta_h, self.batch = policy, dataset, rng, beta_h, batch
-        self.held_out = AggregatedDataset(dataset.obs.rows.shape[1:], dataset.actions.rows.shape[1], 1, rng, bootstrap=False)
-        generator = torch.Generator().manual_seed(seed)
-        self.net = BatchedMLP(1, len(policy.obs_mean), 1, hidden, generator)
+        shape, width = policy.obs_shape, dataset.actions.rows.shape[1]
+        self.held_out = AggregatedDataset(shape, width, 1, rng, bootstrap=False, dtype=stored_as(shape))
+        self.net = network(shape, 1, 1, hidden_layers(shape, hidden, (128, 128)), torch.Generator().manual_seed(seed))
         self.optimiser = adam(self.net.parameters(), learning_rate)
 
     @torch.no_grad()
     def __call__(self, obs: Array) -> Array:
-        """f(s) of each robot: (N, D) -> (N,) in [0, 1]."""
-        return self._logit(torch.from_numpy(np.asarray(obs, dtype=np.float32))).sigmoid().numpy()
+        """f(s) of each robot: (N, D) or (N, H, W, 3) -> (N,) in [0, 1]."""
+        return self._logit(as_tensor(obs)).sigmoid().numpy()
 
     def discrepancies(self, obs: Array, actions: Array) -> Array:
         """L(pi_R(s), a_H) for human data (n, D), (n, A): (n,)."""

@@ -9,6 +9,7 @@ queries alike. A timeout ends an episode, not the future: it is never terminal.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from torch import Tensor
 from tutelage.errors import ConfigError
 from tutelage.fleet.policy import Policy
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
-from tutelage.policies.mlp import BatchedMLP
+from tutelage.policies.networks import Network, Shape, as_tensor, hidden_layers, network, normalise, shape_of, stored_as
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import rng_state, set_rng_state
 
@@ -37,7 +38,7 @@ class CriticConfig:
         learning_rate: of Adam.
         batch: transitions in a gradient step.
         positives: fraction of events in a batch, once there are any.
-        hidden: widths of the hidden layers.
+        hidden: widths of the (fully connected) hidden layers; default: 256 and 256, for images 100, 50 and 10.
         capacity: transitions kept without an event, and a tenth as many with one; the oldest are overwritten.
         pretrain: gradient steps before the run (3000 in the dissertation).
         every: timesteps between gradient steps during the run.
@@ -48,7 +49,7 @@ class CriticConfig:
     learning_rate: float = 3e-4
     batch: int = 256
     positives: float = 0.25
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] | None = None
     capacity: int = 50_000
     pretrain: int = 3000
     every: int = 5
@@ -61,12 +62,31 @@ class CriticConfig:
 
 
 class Ring:
-    """The newest transitions, one behind the other in each row: obs, action, next_obs, end."""
+    """The newest transitions. A row is one, its parts side by side: obs, action, next_obs, end.
 
-    def __init__(self, capacity: int, obs_width: int, action_width: int) -> None:
-        self.capacity, self.size, self.cursor = capacity, 0, 0
-        self.widths = {"obs": obs_width, "action": action_width, "next_obs": obs_width, "end": 1}
-        self.rows = torch.zeros(0, sum(self.widths.values()))
+    Rows are float32, or bytes where observations are images; then a float32 is four of them.
+
+    Args:
+        capacity: of transitions.
+        obs: shape of an observation.
+        action_width: A.
+    """
+
+    def __init__(self, capacity: int, obs: Shape, action_width: int) -> None:
+        self.capacity, self.size, self.cursor, self.obs_shape = capacity, 0, 0, shape_of(obs)
+        self.dtype = stored_as(obs)
+        number, width = 4 if self.dtype == torch.uint8 else 1, math.prod(self.obs_shape)
+        self.widths = {"obs": width, "action": number * action_width, "next_obs": width, "end": number}
+        self.rows = torch.zeros(0, sum(self.widths.values()), dtype=self.dtype)
+
+    def pack(self, obs: Array, action: Array, next_obs: Array, end: Array) -> Array:
+        """n transitions as rows (n, width)."""
+        numbers = [np.asarray(x, dtype=np.float32) for x in (action, end[:, None])]
+        if self.dtype == torch.uint8:
+            numbers = [np.ascontiguousarray(x).view(np.uint8) for x in numbers]
+        flat = len(obs), math.prod(self.obs_shape)  # not -1: there may be no transition
+        parts = obs.reshape(flat), numbers[0], next_obs.reshape(flat), numbers[1]
+        return np.concatenate(parts, axis=1, dtype=numbers[0].dtype)
 
     def add(self, rows: Array) -> None:
         """Append transitions (n, width); memory grows up to the capacity, then the oldest give way."""
@@ -87,6 +107,8 @@ class Ring:
     def columns(self, rows: Tensor) -> dict[str, Tensor]:
         """The parts of rows (n, width), by name: views."""
         parts = dict(zip(self.widths, rows.split(list(self.widths.values()), dim=1), strict=True))
+        for name, part in parts.items():
+            parts[name] = part.unflatten(1, self.obs_shape) if "obs" in name else part.view(torch.float32)
         return {**parts, "end": parts["end"][:, 0]}
 
     def draw(self, n: int, rng: np.random.Generator) -> Tensor:
@@ -107,7 +129,8 @@ class Critic:
     """Estimates the discounted probability of an event under the robot policy.
 
     Args:
-        obs_width, action_width: D, A.
+        obs: shape of an observation: D, or (H, W, 3) for images.
+        action_width: A.
         event: "bad" takes the larger twin (risk), "good" the smaller one (goal).
         policy: chooses the next action in targets.
         config: hyper-parameters.
@@ -117,7 +140,7 @@ class Critic:
 
     def __init__(
         self,
-        obs_width: int,
+        obs: Shape,
         action_width: int,
         event: Literal["bad", "good"],
         policy: Policy,
@@ -128,24 +151,24 @@ class Critic:
     ) -> None:
         self.config, self.policy, self.rng, self.scale = config, policy, rng, scale
         self.event = event
+        hidden = hidden_layers(obs, config.hidden)
         self.net, self.target = (
-            BatchedMLP(2, obs_width + action_width, 1, config.hidden, torch.Generator().manual_seed(seed), torch.sigmoid)
+            network(obs, 2, 1, hidden, torch.Generator().manual_seed(seed), torch.sigmoid, extra=action_width)
             for _ in range(2)
         )
         self.optimiser = adam(self.net.parameters(), config.learning_rate)
-        self.plain = Ring(config.capacity, obs_width, action_width)
-        self.events = Ring(max(1, config.capacity // 10), obs_width, action_width)
+        self.plain = Ring(config.capacity, obs, action_width)
+        self.events = Ring(max(1, config.capacity // 10), obs, action_width)
 
     def __call__(self, obs: Array, actions: Array) -> Array:
-        """Q(s, a) of each robot: (N, D), (N, A) -> (N,) in [0, 1]."""
-        s, a = (torch.from_numpy(np.asarray(x, np.float32)) for x in (obs, actions))
+        """Q(s, a) of each robot: (N, D) or (N, H, W, 3), (N, A) -> (N,) in [0, 1]."""
         with torch.no_grad():
-            q = self._q(self.net, s, a)
+            q = self._q(self.net, as_tensor(obs), as_tensor(actions))
         return self._worst(q).numpy()
 
     def add(self, obs: Array, action: Array, next_obs: Array, event: Array, end: Array) -> None:
         """Take in n transitions. event: (n,) bool, it happened in this step; end: (n,) bool, nothing can follow."""
-        rows = np.concatenate([obs, action, next_obs, end[:, None]], axis=1, dtype=np.float32)
+        rows = self.plain.pack(obs, action, next_obs, end)
         self.events.add(rows[event])
         self.plain.add(rows[~event])
 
@@ -181,11 +204,10 @@ class Critic:
         for _ in range(n):
             self.update()
 
-    def _q(self, net: BatchedMLP, obs: Tensor, actions: Tensor) -> Tensor:
-        """(B, D), (B, A) -> (2, B)."""
+    def _q(self, net: Network, obs: Tensor, actions: Tensor) -> Tensor:
+        """(B, ...), (B, A) -> (2, B)."""
         obs_mean, obs_std, middle, half = self.scale
-        x = torch.cat([((obs - obs_mean) / obs_std).clamp_(-10, 10), (actions - middle) / half], dim=1)
-        return net(x)[:, :, 0]  # type: ignore[no-any-return]
+        return net(normalise(obs, obs_mean, obs_std), (actions - middle) / half)[:, :, 0]  # type: ignore[no-any-return]
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimiser, transitions and random state."""

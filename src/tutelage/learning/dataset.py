@@ -54,12 +54,19 @@ class AggregatedDataset:
         members: K.
         rng: the seeded stream of bags and batches.
         bootstrap: False: every member sees everything.
+        dtype: of the observations in memory: images are kept as bytes.
     """
 
     def __init__(
-        self, obs_shape: tuple[int, ...], action_width: int, members: int, rng: np.random.Generator, bootstrap: bool = True
+        self,
+        obs_shape: tuple[int, ...],
+        action_width: int,
+        members: int,
+        rng: np.random.Generator,
+        bootstrap: bool = True,
+        dtype: torch.dtype = torch.float32,
     ) -> None:
-        self.obs = GrowingArray(obs_shape, torch.float32)
+        self.obs = GrowingArray(obs_shape, dtype)
         self.actions = GrowingArray((action_width,), torch.float32)
         self.bags = [GrowingArray((), torch.int64) for _ in range(members)]
         self.rng, self.bootstrap = rng, bootstrap

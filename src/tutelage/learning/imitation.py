@@ -17,7 +17,6 @@ from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.ensemble import EnsemblePolicy
-from tutelage.policies.mlp import BatchedMLP
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import derive
 
@@ -36,6 +35,8 @@ class LearnerConfig:
         batch: pairs in a gradient step of a member.
         learning_rate: of Adam.
         pretrain: gradient steps of behaviour cloning on the offline data, before the run.
+        precision: of the matrix products in updates during the run. "bfloat16" has 8 bits and sums in 32; it is faster on
+            processors that have such products (AMX, AVX512-BF16) and changes nothing on others.
     """
 
     schedule: Literal["step", "episode", "scratch", "never"] = "step"
@@ -44,10 +45,13 @@ class LearnerConfig:
     batch: int = 256
     learning_rate: float = 3e-4
     pretrain: int = 1000
+    precision: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
         if self.schedule not in ("step", "episode", "scratch", "never"):
             raise ConfigError(f"unknown schedule {self.schedule!r}: use step, episode, scratch or never")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ConfigError(f"unknown precision {self.precision!r}: use float32 or bfloat16")
         if min(self.every, self.gradient_steps, self.batch) < 1 or self.pretrain < 0 or not self.learning_rate > 0:
             raise ConfigError("learning needs every, gradient_steps and batch >= 1, pretrain >= 0 and learning_rate > 0")
 
@@ -93,13 +97,8 @@ class ImitationLearner:
     def restart(self) -> None:
         """New initial weights and a new optimiser; the data stay."""
         self.restarts += 1
-        generator = torch.Generator().manual_seed(derive(self.seed, f"policy/restart {self.restarts}"))
-        net, old = self.policy.net, self.policy.net.weights
-        widths = [w.shape[1] for w in old] + [old[-1].shape[2]]
-        fresh = BatchedMLP(self.policy.members, widths[0], widths[-1], tuple(widths[1:-1]), generator, net.last)
-        net.load_state_dict(fresh.state_dict())
+        self.policy.restart(derive(self.seed, f"policy/restart {self.restarts}"))
         self.optimiser = adam(self.policy.parameters(), self.config.learning_rate)
-        self.policy.forget()
 
     # -- the Learner of the loop --------------------------------------------------------------------------------
 
@@ -119,6 +118,15 @@ class ImitationLearner:
 
     def update(self, t: int) -> dict[str, float]:
         """What is due at timestep t."""
+        if self.config.precision == "float32":
+            return self._update(t)
+        torch.set_float32_matmul_precision("medium")  # of this process, so only while nothing else computes
+        try:
+            return self._update(t)
+        finally:
+            torch.set_float32_matmul_precision("highest")
+
+    def _update(self, t: int) -> dict[str, float]:
         losses: dict[str, float] = {}
         c = self.config
         due = {

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tutelage.errors import ContractError
-from tutelage.policies.mlp import BatchedMLP
+from tutelage.policies.networks import Network, Shape, as_tensor, hidden_layers, network, normalise, shape_of
 from tutelage.policies.weights import load_module_state, load_weights, save_policy
 
 Array = NDArray[Any]
@@ -21,21 +20,21 @@ class EnsemblePolicy(nn.Module):
     """The mean of K networks acts; the variance between them is the uncertainty.
 
     Args:
-        obs_width: D.
+        obs: shape of an observation: D, or (H, W, 3) for images, which a CNN sees (appendix B.2).
         action_low, action_high: (A,) bounds.
         members: K.
-        hidden: widths of the hidden layers.
+        hidden: widths of the (fully connected) hidden layers; default: 256 and 256, for images 100, 50 and 10.
         seed: of the initial weights.
     """
 
     def __init__(
         self,
-        obs_width: int,
+        obs: Shape,
         action_low: Array,
         action_high: Array,
         *,
         members: int = 5,
-        hidden: tuple[int, ...] = (256, 256),
+        hidden: tuple[int, ...] | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -43,21 +42,29 @@ class EnsemblePolicy(nn.Module):
         self.action_half: Tensor
         self.obs_mean: Tensor
         self.obs_std: Tensor
-        self.members = members
-        self.net = BatchedMLP(
-            members, obs_width, len(action_low), hidden, torch.Generator().manual_seed(seed), last=torch.tanh
-        )
+        self.members, self.obs_shape, self.hidden = members, shape_of(obs), hidden_layers(obs, hidden)
+        self.outputs = len(action_low)
+        self.net = self._network(seed)
         low, high = torch.as_tensor(action_low).float(), torch.as_tensor(action_high).float()
         self.register_buffer("action_middle", (high + low) / 2)
         self.register_buffer("action_half", (high - low) / 2)
-        self.register_buffer("obs_mean", torch.zeros(obs_width))
-        self.register_buffer("obs_std", torch.ones(obs_width))
+        self.register_buffer("obs_mean", torch.zeros(self.obs_shape[-1]))
+        self.register_buffer("obs_std", torch.ones(self.obs_shape[-1]))
         self._seen: Array | None = None
         self._said = torch.empty(0)
 
+    def _network(self, seed: int) -> Network:
+        generator = torch.Generator().manual_seed(seed)
+        return network(self.obs_shape, self.members, self.outputs, self.hidden, generator, last=torch.tanh)
+
+    def restart(self, seed: int) -> None:
+        """New initial weights."""
+        self.net.load_state_dict(self._network(seed).state_dict())
+        self.forget()
+
     def save(self, path: Path, card: dict[str, Any]) -> None:
         """Write weights and a card (JSON values) as safetensors."""
-        save_policy(path, self, {**card, "hidden": [w.shape[2] for w in self.net.weights][:-1]})
+        save_policy(path, self, {**card, "hidden": list(self.hidden), "obs_shape": list(self.obs_shape)})
 
     @classmethod
     def load(cls, path: Path) -> tuple[EnsemblePolicy, dict[str, Any]]:
@@ -69,27 +76,33 @@ class EnsemblePolicy(nn.Module):
         """
         weights, card = load_weights(path, cls.__name__)
         try:
-            middle, half, first = weights["action_middle"], weights["action_half"], weights["net.weights.0"]
-            policy = cls(first.shape[1], middle - half, middle + half, members=len(first), hidden=tuple(card["hidden"]))
+            middle, half = weights["action_middle"], weights["action_half"]
+            members = {len(array) for name, array in weights.items() if name.startswith("net.")}  # all lead with K
+            shape = tuple(card.get("obs_shape", weights["obs_mean"].shape))
+            policy = cls(shape, middle - half, middle + half, members=members.pop(), hidden=tuple(card["hidden"]))
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError):
             raise ContractError(f"{path} lacks the shapes of an ensemble on its card") from None
         load_module_state(policy, weights)
         return policy, card
 
     def set_normalisation(self, obs: Array) -> None:
-        """Z-score inputs with the mean and standard deviation of obs (n, D), from now on."""
-        self.obs_mean.copy_(torch.from_numpy(obs.mean(axis=0)))
-        self.obs_std.copy_(torch.from_numpy(obs.std(axis=0).clip(1e-2)))
+        """Z-score inputs with the mean and standard deviation of obs (n, D) or (n, H, W, 3), from now on.
+
+        Those of each number of a vector, and of each channel of an image.
+        """
+        axes = tuple(range(obs.ndim - 1))
+        self.obs_mean.copy_(torch.from_numpy(obs.mean(axis=axes)))
+        self.obs_std.copy_(torch.from_numpy(obs.std(axis=axes).clip(1e-2)))
         self.forget()
 
     def normalise(self, obs: Tensor) -> Tensor:
-        """(..., D) float32 -> z-scores, clipped to 10 standard deviations."""
-        return ((obs - self.obs_mean) / self.obs_std).clamp_(-10, 10)
+        """(..., D) float32 or (..., H, W, 3) bytes -> z-scores, clipped to 10 standard deviations."""
+        return normalise(obs, self.obs_mean, self.obs_std)
 
     def loss(self, obs: Tensor, actions: Tensor) -> Tensor:
         """Mean squared error of each member on its own batch, summed over members, in units of half the action range.
 
-        obs: (K, B, D), actions: (K, B, A).
+        obs: (K, B, D) or (K, B, H, W, 3), actions: (K, B, A).
         """
         target = (actions - self.action_middle) / self.action_half
         error: Tensor = (self.net(self.normalise(obs)) - target).square().mean(dim=(1, 2)).sum()
@@ -103,12 +116,12 @@ class EnsemblePolicy(nn.Module):
     def _ask(self, obs: Array) -> Tensor:
         """What each member would do, (K, N, A) in units of half the range; one pass for `act` and `uncertainty`."""
         if self._seen is not obs:
-            self._said = self.net(self.normalise(torch.from_numpy(np.asarray(obs, dtype=np.float32))))
+            self._said = self.net(self.normalise(as_tensor(obs)))
             self._seen = obs
         return self._said
 
     def act(self, obs: Array) -> Array:
-        """The mean of the members: (N, D) -> (N, A) float32."""
+        """The mean of the members: (N, D) or (N, H, W, 3) -> (N, A) float32."""
         return (self.action_middle + self.action_half * self._ask(obs).mean(dim=0)).numpy()
 
     def uncertainty(self, obs: Array) -> Array:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 
 class BatchedMLP(nn.Module):
-    """K independent ReLU networks of one shape: (K, B, inputs) -> (K, B, outputs), one `baddbmm` a layer.
+    """K independent networks of one shape: (K, B, inputs) -> (K, B, outputs), one `baddbmm` a layer.
 
     Args:
         members: K.
@@ -19,6 +19,7 @@ class BatchedMLP(nn.Module):
         hidden: widths of the hidden layers.
         generator: draws the initial weights (uniform, He et al. as in torch.nn.Linear).
         last: applied to the outputs, such as torch.tanh.
+        activation: of the hidden layers, in place (the sum before it is not needed for gradients).
     """
 
     def __init__(
@@ -29,9 +30,10 @@ class BatchedMLP(nn.Module):
         hidden: tuple[int, ...],
         generator: torch.Generator,
         last: Callable[[Tensor], Tensor] | None = None,
+        activation: Callable[[Tensor], Tensor] = torch.relu_,
     ) -> None:
         super().__init__()
-        self.last = last
+        self.last, self.activation = last, activation
         widths = [inputs, *hidden, outputs]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for a, b in pairwise(widths):
@@ -40,12 +42,17 @@ class BatchedMLP(nn.Module):
                 parameters.append(nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) * bound))
         self._layers = list(zip(self.weights, self.biases, strict=True))  # a ParameterList takes long to say what it holds
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(K, B, inputs), or (B, inputs) for the same inputs to all members -> (K, B, outputs)."""
+    def forward(self, x: Tensor, extra: Tensor | None = None) -> Tensor:
+        """(K, B, inputs), or (B, inputs) for the same inputs to all members -> (K, B, outputs).
+
+        extra: the last of the inputs, (B, E), where they come apart.
+        """
+        if extra is not None:
+            x = torch.cat([x, extra.expand(*x.shape[:-1], -1)], dim=-1)
         if x.dim() == 2:
             x = x.expand(len(self._layers[0][0]), *x.shape)
         for k, (weight, bias) in enumerate(self._layers):
             x = torch.baddbmm(bias, x, weight)
             if k < len(self._layers) - 1:
-                x = x.relu_()  # in place: the sum before it is not needed for gradients
+                x = self.activation(x)
         return self.last(x) if self.last else x

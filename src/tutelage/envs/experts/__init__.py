@@ -1,7 +1,8 @@
 """The shipped controllers that act as algorithmic supervisors, and what each scored.
 
-A controller is a file of trained weights, or a program that the task names (`Task.expert`). One with weights is called
-an expert only if its mean return reaches the published expert's (see `PUBLISHED`). The scores of a program are measured by
+A controller is a file of trained weights, or a program that the task names (its attribute `expert`). One with weights is
+called an expert only if its mean return reaches the published expert's (see `PUBLISHED`). The scores of a program are
+measured by
 
     python -m tutelage.envs.experts.score PegInsertion
 """
@@ -15,10 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from tutelage.envs.registry import find_task, load_object, make_fleet
+from tutelage.envs.registry import ON_EXTRAS, find_task, load_object, make_fleet
 from tutelage.envs.rollout import rollout
 from tutelage.envs.task_fleet import TaskFleet
-from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.policy import Policy
 from tutelage.policies.expert import GaussianActor
@@ -64,8 +64,8 @@ def program_of(task: str) -> str | None:
     Raises:
         ConfigError: an unknown task.
     """
-    found = find_task(task)
-    return found.expert if isinstance(found, type) and issubclass(found, Task) else None
+    program: str | None = getattr(find_task(task), "expert", None)
+    return program
 
 
 def load(task: str, path: Path | None = None) -> tuple[Policy, dict[str, Any]]:
@@ -110,9 +110,14 @@ def is_expert(card: dict[str, Any]) -> bool:
 def evaluate(
     actor: Policy, task: str, level: str, episodes: int = 100, seed: int = 1_000_000, threads: int | None = None
 ) -> Score:
-    """Run a controller for one episode on each of `episodes` robots. The seed is one that no training uses."""
-    fleet = make_fleet(task, episodes, disturbance=level, threads=threads)
-    if not isinstance(fleet, TaskFleet):
+    """Run a controller for one episode on each of `episodes` robots. The seed is one that no training uses.
+
+    Raises:
+        ConfigError: a level that the task does not know; one on an extra knows "none".
+    """
+    has_levels = not (level == "none" and task in ON_EXTRAS)
+    fleet = make_fleet(task, episodes, disturbance=level if has_levels else None, threads=threads)
+    if has_levels and not isinstance(fleet, TaskFleet):
         raise ConfigError(f"{task} has no levels of disturbance to score an expert at")
     episodes_of = rollout(fleet, actor, derive(seed, f"evaluate expert/{level}") % 2**32)
     fleet.close()

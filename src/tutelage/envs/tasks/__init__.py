@@ -1,6 +1,7 @@
 """The built-in tasks."""
 
 from tutelage.envs.tasks.ant import Ant
+from tutelage.envs.tasks.anymal import Anymal
 from tutelage.envs.tasks.ball_balance import BallBalance
 from tutelage.envs.tasks.base import ArrayTask, GoalTask, MujocoTask, Task
 from tutelage.envs.tasks.block_pushing import BlockPushing, ObstaclePushing
@@ -19,6 +20,7 @@ TASKS: dict[str, type[Task]] = {
         Walker2d,
         Ant,
         Humanoid,
+        Anymal,
         PegInsertion,
         CableRouting,
         Navigation,

@@ -46,7 +46,7 @@ class PegInsertion(GoalTask):
     Goal: the ring is around the peg, lower than 5 cm, and let go.
     """
 
-    name, xml, frame_skip = "PegInsertion", "peg_insertion.xml", 125
+    name, xml, frame_skip = "PegInsertion", "peg_insertion.xml", 50
     assets = Path(__file__).parent / "assets"
     fields = ("qpos", "qvel", "site_xpos", "site_xmat")
     push_body, camera = "ring", "fixed"

@@ -119,5 +119,7 @@ class Gate(ABC):
         """(N, 2): who keeps a human, then who asks. A robot in violation does neither: it needs a hard reset."""
         asks = np.where(view.violation, 0.0, self.ask(view))
         # A new episode begins autonomously (line 22 of algorithm 3), unless it begins with a request.
-        keeps = view.supervised & ~view.violation & ((asks > 0) | ~(self.cede(view) | view.fresh))
-        return np.stack([keeps, asks], axis=1).astype(np.float64)
+        ranks = np.empty((2, len(asks)))
+        ranks[0] = view.supervised & ~view.violation & ((asks > 0) | ~(self.cede(view) | view.fresh))
+        ranks[1] = asks
+        return ranks.T

@@ -35,9 +35,9 @@ class HGDAgger(Gate):
         bad, good = (none if run is None else run for run in (self.bad, self.good))
         differs = view.signal("judgement")
         sees = self._watched(view) | view.supervised
-        self.bad = np.where(view.fresh | ~sees, 0, np.where(differs >= self.config.beta_h, bad + 1, 0))
-        close = view.supervised & (differs < self.config.beta_r * self.config.beta_h)
-        self.good = np.where(close & ~view.fresh, good + 1, 0)
+        going_on = ~view.fresh
+        self.bad = (bad + 1) * (sees & going_on & (differs >= self.config.beta_h))
+        self.good = (good + 1) * (view.supervised & going_on & (differs < self.config.beta_r * self.config.beta_h))
         return super().__call__(view)
 
     def ask(self, view: FleetView) -> Array:

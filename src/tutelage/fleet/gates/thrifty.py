@@ -12,6 +12,8 @@ from tutelage.fleet.gates.base import Array, Gate, GateConfig
 from tutelage.fleet.quantiles import StreamingQuantiles
 from tutelage.fleet.view import FleetView
 
+_TINY = float(np.finfo(np.float64).tiny)
+
 
 class ThriftyDAgger(Gate):
     """Intervene where Novelty > delta_h or Risk > beta_H; Cede where L(a_R, a_H) < delta_r and Risk < beta_R.
@@ -47,35 +49,40 @@ class ThriftyDAgger(Gate):
 
     def ask(self, view: FleetView) -> Array:
         """Intervene(s, delta_h, beta_H)."""
-        novelty, risk = self._novelty(view), self._risk(view)
-        intervene = (novelty > self.thresholds["delta_h"]) | (risk > self.thresholds["beta_h"])
-        return np.where(intervene, np.maximum(risk, np.finfo(np.float64).tiny), 0.0)
+        without = self.config.without
+        if without == "risk":
+            return np.where(view.uncertainty > self.thresholds["delta_h"], _TINY, 0.0)
+        risk = 1.0 - view.goal
+        intervene = risk > self.thresholds["beta_h"]
+        if without != "novelty":
+            intervene |= view.uncertainty > self.thresholds["delta_h"]
+        return np.where(intervene, np.maximum(risk, _TINY), 0.0)
 
     def cede(self, view: FleetView) -> Array:
         """Cede(s, delta_r, beta_R)."""
-        # Without risk, no state is too risky to give back in (0 < 0 would say the opposite).
-        calm = self.config.without == "risk" or self._risk(view) < self.thresholds["beta_r"]
-        return (view.discrepancy < self.thresholds["delta_r"]) & calm
+        close: Array = view.discrepancy < self.thresholds["delta_r"]
+        if self.config.without == "risk":
+            return close
+        return close & (1.0 - view.goal < self.thresholds["beta_r"])
 
     def _observe(self, view: FleetView) -> None:
-        own = ~view.supervised & ~view.violation
-        self.novelty.add(self._novelty(view)[own])
-        self.risk.add(self._risk(view)[own])
+        own = ~(view.supervised | view.violation)
+        if self.config.without != "novelty":
+            self.novelty.add(view.uncertainty[own])
+        if self.config.without != "risk":
+            self.risk.add(1.0 - view.goal[own])
         taught = view.discrepancy[np.isfinite(view.discrepancy)]
-        self.taught += len(taught)
-        self.discrepancy += float(taught.sum())
-        if view.fresh.any() and len(self.novelty) >= self.config.history:
+        if len(taught):
+            self.taught += len(taught)
+            self.discrepancy += float(taught.sum())
+        if view.fresh.any() and max(len(self.novelty), len(self.risk)) >= self.config.history:
             q = 1 - self.config.budget(view.t)
-            self.thresholds["delta_h"], self.thresholds["beta_h"] = self.novelty.quantile(q), self.risk.quantile(q)
-            self.thresholds["beta_r"] = self.risk.quantile(0.5)
+            if len(self.novelty):
+                self.thresholds["delta_h"] = self.novelty.quantile(q)
+            if len(self.risk):
+                self.thresholds["beta_h"], self.thresholds["beta_r"] = self.risk.quantile(q), self.risk.quantile(0.5)
             if self.taught:
                 self.thresholds["delta_r"] = self.discrepancy / self.taught
-
-    def _novelty(self, view: FleetView) -> Array:
-        return np.zeros(view.num_robots) if self.config.without == "novelty" else view.uncertainty
-
-    def _risk(self, view: FleetView) -> Array:
-        return np.zeros(view.num_robots) if self.config.without == "risk" else 1.0 - view.goal
 
     def state_dict(self) -> dict[str, Any]:
         """Thresholds, and the history that they come from."""

@@ -1,0 +1,33 @@
+"""What applications send and receive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message that arrived, opened and verified.
+
+    Attributes:
+        payload: as it was sent.
+        sender: name of the node that sent it.
+        topic: alias of the topic.
+        sequence: counts up within a start of the sender; gaps are messages that are lost for good.
+        sent: seconds since 1970 on the sender's clock.
+        received: seconds since 1970 on our clock, when the packet came from the network.
+        authentic: False only for provisional messages of chain mode.
+    """
+
+    payload: bytes
+    sender: str
+    topic: str
+    sequence: int
+    sent: float
+    received: float
+    authentic: bool = True
+
+    @property
+    def latency(self) -> float:
+        """Seconds from sender to receiver; as exact as the two clocks agree."""
+        return self.received - self.sent

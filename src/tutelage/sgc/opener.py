@@ -1,0 +1,324 @@
+"""The receiver's side of sealing."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+
+from cryptography.exceptions import InvalidSignature, InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+from tutelage.sgc.chain import Confirmation
+from tutelage.sgc.errors import NotAllowed
+from tutelage.sgc.grants import key_id
+from tutelage.sgc.keyring import Keyring
+from tutelage.sgc.packet import (
+    ANCHOR,
+    BARE,
+    BARE_BODY,
+    BARE_PROOF,
+    BATCH,
+    BODY,
+    HEADER,
+    IDENT,
+    INTRODUCTION,
+    MODES,
+    PROOF,
+    SENDER,
+    STREAM,
+    Buffer,
+    Header,
+    Opened,
+    Statements,
+    message_key,
+    nonce,
+    read_header,
+    split_batch,
+)
+from tutelage.sgc.reasons import Reason, Refusals, Refused
+from tutelage.sgc.replay import MAX_SENDERS, Replay
+from tutelage.sgc.rules import Authenticity, Lane, Role
+from tutelage.sgc.session import Handshake, Session, slots
+from tutelage.sgc.trust import Member
+
+_LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys and policy
+_MAX_STREAMS = 1024
+_MAX_SESSIONS = 1024
+
+
+class Opener:
+    """Opens what others sent on one topic and lane. Raises only `Refused`, whatever the bytes. Safe to use from several
+    threads.
+
+    Attributes:
+        alias, lane: what it opens.
+        refusals: counts of refusals by reason; chain mode also counts there what is refused after `open_many` returned.
+    """
+
+    def __init__(self, keyring: Keyring, alias: str, lane: Lane = Lane.STREAM, *, provisional: bool = False) -> None:
+        """
+        Args:
+            keyring: of the node that receives.
+            alias: of the topic.
+            lane: which way.
+            provisional: chain mode: give messages before they are confirmed, as `authentic=False`. Default: hold them
+                until the sender's next anchor confirms them.
+
+        Raises:
+            NotAllowed: the policy does not let this node receive there.
+        """
+        self.alias, self.lane = alias, lane
+        self.refusals = Refusals()
+        self._keyring, self._home = keyring, keyring.home
+        self._entry = self._home.access.check(alias, lane, sends=False)
+        self._authenticity = self._entry.rule.authenticity_on(lane)
+        self._mode = MODES[self._authenticity]
+        self._name = bytes(self._entry.name)
+        self._provisional = provisional
+        self._statements = Statements(self._name, lane)
+        self._replay = Replay(self._entry.rule.max_age, time.time_ns())
+        self._confirmation = Confirmation(self._statements, self.refusals, provisional=provisional)
+        self._handshake = Handshake(self._home, self._entry, lane)
+        self._lock = threading.RLock()
+        self._looked = 0
+        self._versions = (-1, -1)
+        self._look_count = 0
+        self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
+        self._members: OrderedDict[bytes, Member] = OrderedDict()
+        self._sessions: OrderedDict[tuple[bytes, bytes, bytes], Session] = OrderedDict()
+
+    def open(self, packet: Buffer, *, bind: bytes = b"", now: int | None = None) -> Opened:
+        """The one message of a packet.
+
+        bind: what the sender bound the message to.
+        now: nanoseconds since 1970; default: the clock.
+
+        Raises:
+            Refused: see `Reason`. Also if there is not exactly one message: use `open_many`.
+        """
+        messages = self.open_many(packet, bind=bind, now=now)
+        if len(messages) != 1:
+            self.refusals.add(Reason.MALFORMED)
+            raise Refused(Reason.MALFORMED, f"a packet of {self.alias} with {len(messages)} messages instead of one")
+        return messages[0]
+
+    def open_many(self, packet: Buffer, *, bind: bytes = b"", now: int | None = None) -> list[Opened]:
+        """All messages that a packet holds or confirms, in order: one for a plain packet, n for a batch, 0 or more in
+        chain mode.
+
+        Raises:
+            Refused: see `Reason`. Counted.
+        """
+        try:
+            return self._open(memoryview(packet), bind, time.time_ns() if now is None else now)
+        except Refused as refused:
+            self.refusals.add(refused.reason)
+            raise
+        except NotAllowed as error:  # the policy has changed
+            self.refusals.add(Reason.NOT_ALLOWED)
+            raise Refused(Reason.NOT_ALLOWED, str(error)) from None
+
+    def offer_session(self) -> bytes:
+        """Session mode: a handshake packet for the sender's `Sealer.accept_session`; good for a minute."""
+        with self._lock:
+            return self._handshake.offer()
+
+    def complete_session(self, answer: bytes) -> str:
+        """Session mode: take the sender's answer. Returns the name of the sender.
+
+        Raises:
+            Refused: no answer to an offer of ours, or not from a node that may send. Counted.
+        """
+        with self._lock:
+            with self.refusals.counting():
+                sender, salt, session = self._handshake.complete(answer)
+            self._sessions[sender, salt, session.ident] = session
+            while len(self._sessions) > _MAX_SESSIONS:
+                self._sessions.popitem(last=False)
+            return session.member.node
+
+    def _open(self, packet: memoryview, bind: bytes, now: int) -> list[Opened]:
+        header = read_header(packet, self._mode)
+        raw = bytes(packet[:HEADER])
+        bare = header.flags & BARE
+        if not bare:
+            self._replay.check(header.sender, header.salt, header.first, header.sent, now)  # cheap, so first
+        stream = self._stream(header, raw, now)
+        start, end = HEADER + header.introduction, len(packet) - header.proof
+        if bare:
+            _decrypt(stream.cipher, BARE_BODY, packet[start:end], raw)
+            member = self._member(stream, header, raw, packet[HEADER:start], now)
+            return self._anchor(stream, BARE_PROOF, header, raw, packet[end:], member, now)
+        body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
+        if self._authenticity == Authenticity.SESSION:
+            member = self._session_member(stream, header, raw, packet, end, now)
+        else:
+            member = self._member(stream, header, raw, packet[HEADER:start], now)
+        messages = self._messages(header, raw, member, body)
+        if self._authenticity == Authenticity.CHAIN:
+            return self._chained(stream, header, raw, bind, body, packet[end:], member, messages, now)
+        if self._authenticity == Authenticity.SIGNATURE:
+            signature = _decrypt(stream.cipher, PROOF, packet[end:], raw)
+            try:
+                member.signing.verify(signature, self._statements.message(raw, bind, body))
+            except InvalidSignature:
+                raise Refused(Reason.FORGED, f"a message of {self.alias} that {member.node} did not sign") from None
+        self._replay.admit(header.sender, header.salt, header.first, len(messages), header.sent)
+        if stream.member is not member:
+            self._remember(stream, raw, member)
+        return messages
+
+    def _chained(
+        self,
+        stream: _Stream,
+        header: Header,
+        raw: bytes,
+        bind: bytes,
+        body: bytes,
+        proof: memoryview,
+        member: Member,
+        messages: list[Opened],
+        now: int,
+    ) -> list[Opened]:
+        statement = self._statements.message(raw, bind, body)
+        with self._lock:
+            ready = self._confirmation.message(
+                (header.sender, header.salt), header.first, statement, messages, len(body), now
+            )
+        if ready is not None:
+            self._replay.admit(header.sender, header.salt, header.first, len(ready), header.sent)
+        if stream.member is not member:
+            self._remember(stream, raw, member)
+        if header.flags & ANCHOR:
+            return (ready or []) + self._anchor(stream, PROOF, header, raw, proof, member, now)
+        return ready or []
+
+    def _anchor(
+        self, stream: _Stream, purpose: int, header: Header, raw: bytes, proof: memoryview, member: Member, now: int
+    ) -> list[Opened]:
+        anchor = _decrypt(stream.cipher, purpose, proof, raw)
+
+        def admit(first: int, messages: list[Opened]) -> None:
+            self._replay.check_time(messages[0].sent, now)
+            self._replay.admit(header.sender, header.salt, first, len(messages), messages[0].sent)
+
+        with self._lock:
+            return self._confirmation.anchor((header.sender, header.salt), anchor, member.signing, admit)
+
+    def _messages(self, header: Header, raw: bytes, member: Member, body: bytes) -> list[Opened]:
+        authentic = self._authenticity != Authenticity.CHAIN or not self._provisional
+        node, first, salt, sent, epoch = member.node, header.first, header.salt, header.sent, header.epoch
+        if not header.flags & BATCH:
+            return [Opened(body, node, first, salt, sent, epoch, authentic, raw[IDENT])]
+        who = raw[12:44]
+        return [
+            Opened(bytes(part), node, sequence, salt, sent, epoch, authentic, who + sequence.to_bytes(8, "big"))
+            for sequence, part in enumerate(split_batch(body), first)
+        ]
+
+    def _stream(self, header: Header, raw: bytes, now: int) -> _Stream:
+        """What is known of the packet's stream; of a new one nothing is kept yet, as anybody can make up a salt.
+
+        Looks from time to time, and at every change: is the epoch accepted, may the sender still send, may we receive?
+        """
+        if (
+            now - self._looked > _LOOK_EVERY
+            or now < self._looked
+            or self._versions != (self._keyring.version, self._home.version)
+        ):
+            self._look(now)
+        stream = self._streams.get(raw[STREAM])
+        if stream is not None and stream.look == self._look_count:
+            return stream
+        key = self._keyring.opening(self.alias, header.epoch, now / 1e9).key
+        if stream is None:
+            cipher = message_key(key, self._name, self.lane, header.epoch, header.sender, header.salt)
+            return _Stream(AESGCM(cipher), self._look_count)
+        if stream.member is not None and not header.introduction:
+            self._check(stream.member, now)
+        stream.look = self._look_count
+        return stream
+
+    def _remember(self, stream: _Stream, raw: bytes, member: Member) -> None:
+        """Keep what an authentic packet taught."""
+        with self._lock:
+            stream.member = member
+            self._streams[raw[STREAM]] = stream
+            while len(self._streams) > _MAX_STREAMS:
+                self._streams.popitem(last=False)
+            if self._authenticity != Authenticity.SESSION:
+                self._members[raw[SENDER]] = member
+                while len(self._members) > MAX_SENDERS:
+                    self._members.popitem(last=False)
+
+    def _member(self, stream: _Stream, header: Header, raw: bytes, introduction: memoryview, now: int) -> Member:
+        """Who the sender is, from its introduction or an earlier one; it may send, now."""
+        if header.introduction:
+            member = self._home.trust.read(_decrypt(stream.cipher, INTRODUCTION, introduction, raw))
+            if self._id_of(member) != header.sender:
+                raise Refused(Reason.FORGED, f"a packet of {self.alias} with the credential of another, {member.node}")
+        elif stream.member is not None:
+            return stream.member  # `_stream` has checked it
+        else:
+            found = self._members.get(header.sender) or self._from_keyring(header.sender)
+            if found is None:
+                raise Refused(Reason.UNKNOWN_SENDER, f"a packet of {self.alias} by a sender that is not introduced yet")
+            member = found
+        self._check(member, now)
+        return member
+
+    def _session_member(self, stream: _Stream, header: Header, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
+        for ident, tag in slots(packet[end:]):
+            session = self._sessions.get((header.sender, header.salt, ident))
+            if session is not None and now / 1e9 < session.until:
+                session.check(raw, packet[:end], tag)
+                if session.member is not stream.member:  # else `_stream` has checked it
+                    self._check(session.member, now)
+                return session.member
+        raise Refused(Reason.NO_SESSION, f"a packet of {self.alias} by a sender with whom no session is open")
+
+    def _check(self, member: Member, now: int) -> None:
+        self._home.trust.check(member, now / 1e9)
+        if member.role != Role.NODE or not self._entry.rule.may_send(member.node, self.lane):
+            raise Refused(Reason.NOT_ALLOWED, f"{member.node} may not send {self.alias}; if it should, add it to the policy")
+
+    def _from_keyring(self, sender: bytes) -> Member | None:
+        return next((member for member in self._keyring.known(self.alias) if self._id_of(member) == sender), None)
+
+    def _id_of(self, member: Member) -> bytes:
+        return key_id(self._entry.secret, b"sender", member.signing)
+
+    def _look(self, now: int) -> None:
+        with self._lock:
+            versions = (self._keyring.version, self._home.version)
+            if versions[1] != self._versions[1]:
+                self._entry = self._home.access.check(self.alias, self.lane, sends=False)
+                if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
+                    raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
+                self._replay.set_max_age(self._entry.rule.max_age)
+            self._versions, self._looked = versions, now
+            self._look_count += 1
+
+
+class _Stream:
+    """One start of one sender under one epoch.
+
+    Attributes:
+        cipher: of its packets.
+        look: when it was last checked, in looks.
+        member: who it is; None before the first authentic packet.
+    """
+
+    __slots__ = ("cipher", "look", "member")
+
+    def __init__(self, cipher: AESGCM, look: int) -> None:
+        self.cipher, self.look = cipher, look
+        self.member: Member | None = None
+
+
+def _decrypt(cipher: AESGCM, purpose: int, sealed: memoryview, associated: bytes) -> bytes:
+    try:
+        return cipher.decrypt(nonce(purpose, associated), sealed, associated)
+    except InvalidTag:
+        raise Refused(Reason.TAMPERED, "a packet that was changed on its way, or not made with the topic's key") from None

@@ -1,0 +1,204 @@
+"""What a packet looks like, and the two digests that proofs are made over.
+
+    header (60 bytes) | introduction, sometimes | ciphertext | tag (16) | proof of the sender
+
+    header: version 1 | mode 1 | flags 2 | length of introduction 2 | of proof 2 | epoch 4 | sender 16 | salt 16 |
+            sequence 8 | sent 8
+
+All integers are big endian; `sent` is in nanoseconds since 1970. The header is in clear and authenticated. The sender is a
+key id that only members of the topic can link to a node; it differs from topic to topic.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+from tutelage.errors import ConfigError
+from tutelage.sgc.envelope import derive
+from tutelage.sgc.reasons import Reason, Refused
+from tutelage.sgc.rules import Authenticity, Lane
+from tutelage.sgc.wire import pack
+
+Buffer = bytes | bytearray | memoryview
+Packet = bytes | bytearray
+"""What `Sealer` gives and a transport carries. A bytearray saves a copy of large messages; it is the caller's own."""
+
+MAX_PAYLOAD = 64 << 20
+MAX_BATCH = 65_536
+MAX_PART = 65_535
+TAG = 16
+SALT_BYTES = 16
+VERSION = 1
+MODES = {Authenticity.SIGNATURE: 1, Authenticity.SESSION: 2, Authenticity.CHAIN: 3}
+_HEADER = struct.Struct(">BBHHHI16s16sQQ")
+HEADER = _HEADER.size
+STREAM, SENDER, IDENT = slice(8, 44), slice(12, 28), slice(12, 52)
+"""Parts of a header: epoch, sender and salt; sender; sender, salt and sequence."""
+MAX_PACKET = HEADER + MAX_PAYLOAD + 4 * (MAX_BATCH + 1) + TAG + 2 * MAX_PART
+_CONTEXT = b"tutelage message 1"
+_CHUNK = 1 << 20
+_COUNT = struct.Struct(">I")
+
+BATCH, ANCHOR, BARE = 1, 2, 4
+"""Flags: the body holds many messages; the proof confirms earlier ones too; there is no message, only a proof."""
+
+BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG = range(6)
+"""What a nonce is for: the first 4 of its 12 bytes, so that one sequence number serves several without repetition."""
+_PURPOSES = [purpose.to_bytes(4, "big") for purpose in range(6)]
+
+
+class Header(NamedTuple):
+    """Fields of a header."""
+
+    version: int
+    mode: int
+    flags: int
+    introduction: int
+    proof: int
+    epoch: int
+    sender: bytes
+    salt: bytes
+    first: int
+    sent: int
+
+
+make_header = _HEADER.pack
+"""The fields of `Header` as bytes."""
+
+
+def read_header(packet: memoryview, mode: int) -> Header:
+    """The header of a packet, if it is one of ours of this mode.
+
+    Raises:
+        Refused: MALFORMED, OVERSIZE or WRONG_MODE.
+    """
+    if len(packet) > MAX_PACKET:
+        raise Refused(Reason.OVERSIZE, f"a packet of {len(packet)} bytes; {MAX_PACKET} are allowed")
+    if len(packet) < HEADER + TAG:
+        raise Refused(Reason.MALFORMED, f"a packet of {len(packet)} bytes")
+    header = Header._make(_HEADER.unpack_from(packet))
+    if header.version != VERSION:
+        raise Refused(Reason.MALFORMED, f"a packet of version {header.version}; this is version {VERSION}")
+    if header.mode != mode:
+        raise Refused(Reason.WRONG_MODE, f"authenticity {header.mode}, and the policy says {mode}")
+    if header.flags > 7 or header.first == 0 or header.introduction + header.proof > len(packet) - HEADER - TAG:
+        raise Refused(Reason.MALFORMED, "a packet with an impossible header")
+    if bool(header.flags & (ANCHOR | BARE)) and (mode != MODES[Authenticity.CHAIN] or not header.flags & ANCHOR):
+        raise Refused(Reason.MALFORMED, "a packet with flags of another mode")
+    return header
+
+
+def ident(packet: Buffer) -> bytes:
+    """40 bytes that identify a packet: sender, salt and sequence. A reply binds to that of its request."""
+    return bytes(memoryview(packet)[IDENT])
+
+
+def nonce(purpose: int, header: bytes) -> bytes:
+    """12 bytes that never repeat under one key: what for, and the sequence number in a header. Keys differ by salt, and a
+    salt is never used twice."""
+    return _PURPOSES[purpose] + header[44:52]
+
+
+def message_key(epoch_key: bytes, name: bytes, lane: Lane, epoch: int, sender: bytes, salt: bytes) -> bytes:
+    """The AES-256 key of one start of one sender: HKDF-SHA256(epoch's key, salt; topic, lane, epoch, sender)."""
+    return derive(epoch_key, salt, pack(_CONTEXT, name, lane.encode(), epoch.to_bytes(4, "big"), sender))
+
+
+class Statements:
+    """What is signed about messages of a topic and lane."""
+
+    def __init__(self, name: bytes, lane: Lane) -> None:
+        self._message = pack(_CONTEXT, name, lane.encode())
+        self._anchor = pack(_CONTEXT + b" anchor", name, lane.encode())
+
+    def message(self, header: bytes, bind: bytes, body: Buffer) -> bytes:
+        """Everything that a message is: topic, lane, header, what it is bound to, and a digest of its body."""
+        return b"".join((self._message, header, len(bind).to_bytes(4, "big"), bind, digest(body)))
+
+    def anchor(self, sender: bytes, salt: bytes, entries: bytes) -> bytes:
+        """That these messages are ours. entries: sequence (8) and SHA-256 of its statement (32), for each."""
+        return b"".join((self._anchor, sender, salt, entries))
+
+
+def digest(body: Buffer) -> bytes:
+    """SHA-256; of more than 1 MiB: SHA-256 over the SHA-256 of each MiB, in threads. The two cannot be confused, as the
+    statement that holds the digest is about a message of one length."""
+    if len(body) <= _CHUNK:
+        return b"\0" + hashlib.sha256(body).digest()
+    view = memoryview(body)
+    chunks = [view[at : at + _CHUNK] for at in range(0, len(view), _CHUNK)]
+    parts = _pool().map(lambda chunk: hashlib.sha256(chunk).digest(), chunks)
+    return b"\1" + hashlib.sha256(b"".join(parts)).digest()
+
+
+def join_batch(payloads: Sequence[Buffer]) -> bytes:
+    """The body of a batch: count, lengths, payloads.
+
+    Raises:
+        ConfigError: none, or too many.
+    """
+    if not 0 < len(payloads) <= MAX_BATCH:
+        raise ConfigError(f"a batch has 1 to {MAX_BATCH} messages, not {len(payloads)}")
+    lengths = struct.pack(f">{len(payloads)}I", *map(len, payloads))
+    return b"".join((_COUNT.pack(len(payloads)), lengths, *payloads))
+
+
+def split_batch(body: Buffer) -> list[memoryview]:
+    """The payloads of a batch.
+
+    Raises:
+        Refused: MALFORMED.
+    """
+    view = memoryview(body)
+    if len(view) < 4:
+        raise Refused(Reason.MALFORMED, "a batch without a count")
+    (count,) = _COUNT.unpack_from(view)
+    if not 0 < count <= MAX_BATCH or len(view) < 4 + 4 * count:
+        raise Refused(Reason.MALFORMED, f"a batch of {count} messages")
+    lengths = struct.unpack_from(f">{count}I", view, 4)
+    at, found = 4 + 4 * count, []
+    if at + sum(lengths) != len(view):
+        raise Refused(Reason.MALFORMED, "a batch whose lengths do not add up")
+    for length in lengths:
+        found.append(view[at : at + length])
+        at += length
+    return found
+
+
+class Opened(NamedTuple):
+    """A message that was opened.
+
+    Attributes:
+        payload: the message.
+        sender: name of the node.
+        sequence: 1, 2, ... within (sender, salt), without gaps where nothing was lost. Batches count every message.
+        salt: 16 bytes, new each time that the sender starts.
+        sent: nanoseconds since 1970 on the sender's clock.
+        epoch: of the key.
+        authentic: False only for provisional messages of chain mode that are not confirmed yet.
+        ident: 40 bytes that identify the message: sender, salt and sequence; a reply binds to its request's.
+    """
+
+    payload: bytes
+    sender: str
+    sequence: int
+    salt: bytes
+    sent: int
+    epoch: int
+    authentic: bool
+    ident: bytes
+
+
+_threads: ThreadPoolExecutor | None = None
+
+
+def _pool() -> ThreadPoolExecutor:
+    global _threads
+    if _threads is None:
+        _threads = ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="digest")
+    return _threads

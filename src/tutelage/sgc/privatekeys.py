@@ -1,0 +1,47 @@
+"""Private keys as files that only their owner may read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+
+from tutelage.files import write_atomic
+
+
+def save_key(path: Path, key: Ed25519PrivateKey | X25519PrivateKey, passphrase: bytes | None = None) -> None:
+    """Write a key (PKCS#8, PEM, mode 0600), encrypted if there is a passphrase."""
+    encryption = serialization.BestAvailableEncryption(passphrase) if passphrase else serialization.NoEncryption()
+    content = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
+    write_atomic(path, content, private=True)
+
+
+def load_signing_key(path: Path, passphrase: bytes | None = None) -> Ed25519PrivateKey:
+    """Read an Ed25519 key.
+
+    Raises:
+        ValueError, TypeError: not such a key, or not with this passphrase. OSError: cannot be read.
+    """
+    key = _load(path, passphrase)
+    if not isinstance(key, Ed25519PrivateKey):
+        raise ValueError(f"{path.name} holds a key of another kind")
+    return key
+
+
+def load_sealing_key(path: Path) -> X25519PrivateKey:
+    """Read an X25519 key.
+
+    Raises:
+        ValueError, TypeError: not such a key. OSError: cannot be read.
+    """
+    key = _load(path, None)
+    if not isinstance(key, X25519PrivateKey):
+        raise ValueError(f"{path.name} holds a key of another kind")
+    return key
+
+
+def _load(path: Path, passphrase: bytes | None) -> Any:
+    return serialization.load_pem_private_key(path.read_bytes(), passphrase)

@@ -1,0 +1,367 @@
+"""Sending: a message goes out at once while the publisher is idle; what queues up meanwhile is sealed together.
+
+A signature costs as much as sealing a hundred small messages, so a publisher that is busy seals what has queued up as one
+packet with one proof. An idle one seals in the caller's thread, so batching never delays a lone message.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from tutelage.errors import ConfigError, TutelageError
+from tutelage.sgc import frames, lanes
+from tutelage.sgc.access import Authenticity, Delivery, Entry
+from tutelage.sgc.errors import NoKey
+from tutelage.sgc.history import History
+from tutelage.sgc.reasons import Refusals, Refused
+from tutelage.sgc.sealing import Sealer
+from tutelage.sgc.transport.base import Congested, Transport
+
+log = logging.getLogger(__name__)
+
+QUEUE_MESSAGES = 1024
+QUEUE_BYTES = 64 << 20
+BATCH_MESSAGES = 256
+BATCH_BYTES = 128 << 10
+INLINE = 16 << 10
+"""Bytes of the largest message that is sealed in the caller's thread: so much the system's own buffers always take."""
+
+SPACING = {Authenticity.SIGNATURE: 0.0004, Authenticity.SESSION: 0.0002, Authenticity.CHAIN: 0.0002}
+"""Seconds between packets of a busy publisher. Receivers need 0.05 ms for one, 0.2 ms for a signed one; so they keep up."""
+
+FIRST_LIFE, LAST_LIFE = 0.05, 5.0
+"""Seconds of silence after which a reliable stream shows what it has sent so far; the pause doubles up to the second."""
+
+GREETINGS = 0.1
+"""Seconds between two introductions that strangers may ask for."""
+
+
+class Publisher:
+    """Sends the messages of one topic. Safe to use from several threads."""
+
+    def __init__(self, alias: str, entry: Entry, sealer: Sealer, transport: Transport, need_key: Callable[[], None]) -> None:
+        """
+        Args:
+            entry: the topic.
+            sealer: a new one; nobody else may use it.
+            need_key: called when the topic's key is missing.
+        """
+        self.alias = alias
+        self.refusals = Refusals()
+        self.sent = self.packets = self.bytes = self.congested = self.superseded = self.answered = 0
+        self._rule = entry.rule
+        self._lossy = entry.rule.delivery == Delivery.LOSSY
+        self._spread = 1_000_000_000 if entry.rule.max_age is None else int(entry.rule.max_age * 1e8)  # nanoseconds
+        self._spacing = SPACING[entry.rule.authenticity]
+        self._sealer = sealer
+        self._sealing = threading.Lock()
+        self._transport = transport
+        self._need_key = need_key
+        self._key = lanes.key(entry.name, lanes.STREAM)
+        self._answer_key = lanes.key(entry.name, lanes.ANSWER)
+        self._history = History(max_age=entry.rule.max_age)
+        self._born = time.monotonic()
+        self._changed = threading.Condition(threading.Lock())
+        self._queue: deque[tuple[bytes, int]] = deque()  # with the time at which it was sent, nanoseconds since 1970
+        self._queued = 0
+        self._offers: deque[bytes] = deque(maxlen=64)
+        self._busy = False
+        self._closing = False
+        self._failure: TutelageError | None = None
+        self._flushing = 0
+        self._free_at = self._greeted = 0.0
+        self._wakes_at = float("-inf")
+        session = entry.rule.authenticity == Authenticity.SESSION
+        self._life_at = self._born if session else float("inf")  # receivers without a session learn that we are there
+        self._pause = FIRST_LIFE
+        self._anchor_every: float = getattr(sealer, "anchor_every", 0.02)
+        self._chain = entry.rule.authenticity == Authenticity.CHAIN
+        self._anchor_at = float("inf")
+        self._handles = [transport.subscribe(lanes.key(entry.name, lanes.HELLO), self._on_hello)]
+        if session:
+            self._handles.append(transport.subscribe(lanes.key(entry.name, lanes.OFFER), self._on_offer))
+        if not self._lossy:
+            self._handles.append(transport.serve(lanes.key(entry.name, lanes.REPLAY, sealer.salt.hex()), self._replay))
+        self._thread = threading.Thread(target=self._work, name=f"sgc-publish-{alias}", daemon=True)
+        self._thread.start()
+
+    def send(self, payload: bytes | bytearray | memoryview, *, wait: float = 0.0) -> None:
+        """Queue a message. An idle publisher sends it before this returns; a busy one seals what queued up in batches.
+
+        Without the topic's key, messages wait in the queue until the owner has sent it. Lossy topics: a message that is
+        still queued when the next one comes is replaced.
+
+        wait: seconds to wait for room if the queue is full.
+
+        Raises:
+            Congested: reliable topics: the queue is full, as the network is slower than the sender. Nothing was queued.
+            ConfigError: the message is too large, or the publisher is closed.
+            NotIssued: the node's certificate has expired.
+        """
+        if len(payload) > frames.MAX_MESSAGE:
+            raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {len(payload):,} bytes")
+        sent = time.time_ns()
+        with self._changed:
+            self._check()
+            alone = not self._busy and not self._queue and len(payload) <= INLINE and time.monotonic() >= self._free_at
+            if alone:
+                self._busy = True
+            else:
+                self._enqueue(bytes(payload), sent, wait)
+        if alone:
+            batch = [(payload if isinstance(payload, bytes) else bytes(payload), sent)]
+            self._ship(batch)
+
+    def flush(self, timeout: float) -> bool:
+        """Wait until everything queued has been handed to the transport; False: it was not within `timeout` seconds."""
+        with self._changed:
+            self._flushing += 1
+            try:
+                return self._changed.wait_for(lambda: not self._queue and not self._busy, timeout)
+            finally:
+                self._flushing -= 1
+
+    def close(self) -> None:
+        """Send what is queued (at most a second), then stop."""
+        self.flush(1.0)
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        for handle in self._handles:
+            handle.close()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(2.0)
+
+    def key_came(self) -> None:
+        """The topic's key may be there now."""
+        with self._changed:
+            self._changed.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        """Has it been closed?"""
+        return self._closing
+
+    @property
+    def queued(self) -> int:
+        """Messages that wait."""
+        return len(self._queue)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    # -- queue; the lock is held -------------------------------------------------------------------------------------------
+
+    def _check(self) -> None:
+        if self._closing:
+            raise ConfigError(f"the publisher of {self.alias} is closed")
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+
+    def _enqueue(self, payload: bytes, sent: int, wait: float) -> None:
+        if self._lossy and self._queue:
+            self.superseded += len(self._queue)
+            self._queue.clear()
+            self._queued = 0
+
+        def room() -> bool:
+            return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._queued + len(payload) <= QUEUE_BYTES)
+
+        if not room() and not (wait > 0 and self._changed.wait_for(lambda: self._closing or room(), wait)):
+            self.congested += 1
+            raise Congested(
+                f"the queue of {self.alias} is full ({len(self._queue)} messages): the network is slower than the sender; "
+                "send less, or use a lossy topic"
+            )
+        self._check()
+        self._queue.append((payload, sent))
+        self._queued += len(payload)
+        self._changed.notify_all()
+
+    def _take(self) -> list[tuple[bytes, int]]:
+        """What goes out next: small messages together, a large one alone. A packet has the age of its oldest message."""
+        batch = [self._queue.popleft()]
+        size = len(batch[0][0])
+        until = batch[0][1] + self._spread
+        while (
+            self._queue
+            and len(batch) < BATCH_MESSAGES
+            and size + len(self._queue[0][0]) <= BATCH_BYTES
+            and self._queue[0][1] <= until
+        ):
+            batch.append(self._queue.popleft())
+            size += len(batch[-1][0])
+        self._queued -= size
+        return batch
+
+    # -- sealing and sending; `_busy` is set -------------------------------------------------------------------------------
+
+    def _ship(self, batch: list[tuple[bytes, int]]) -> None:
+        """Seal and send; without a key, back into the queue."""
+        try:
+            age = time.monotonic() - self._born
+            if len(batch) == 1 and len(batch[0][0]) > frames.PIECE:
+                for piece in frames.pieces(memoryview(batch[0][0]), age):
+                    self._publish([piece], batch[0][1])
+            else:
+                head = frames.head(frames.Kind.WHOLE, age)
+                self._publish([head + payload for payload, _ in batch], batch[0][1])
+            self.sent += len(batch)
+            self.bytes += len(batch[0][0]) if len(batch) == 1 else sum(len(payload) for payload, _ in batch)
+        except NoKey:
+            with self._changed:
+                self._queue.extendleft(reversed(batch))
+                self._queued += sum(len(payload) for payload, _ in batch)
+                self._free_at = time.monotonic() + FIRST_LIFE
+            self._need_key()
+        except TutelageError as error:  # for instance NotIssued: told to the next who sends
+            self._failure = error
+        finally:
+            self._idle()
+
+    def _idle(self) -> None:
+        now = time.monotonic()
+        with self._changed:
+            self._busy = False
+            self._free_at = max(self._free_at, now + self._spacing)
+            self._pause = FIRST_LIFE
+            self._life_at = now + FIRST_LIFE if not self._lossy else float("inf")
+            if self._chain:
+                self._anchor_at = min(self._anchor_at, now + self._anchor_every)
+            # The worker is woken only if it must do something sooner than it thinks: a wake costs more than a small message.
+            if self._queue or self._flushing or min(self._life_at, self._anchor_at) < self._wakes_at:
+                self._changed.notify_all()
+
+    def _publish(self, payloads: list[bytes], sent: int) -> None:
+        with self._sealing:
+            before = self._sealer.sequence
+            if len(payloads) == 1:
+                packet = self._sealer.seal(payloads[0], now=sent)
+            else:
+                packet = self._sealer.seal_many(payloads, now=sent)
+            self._hand_over(before + 1, packet)
+
+    def _hand_over(self, first: int, packet: bytes | bytearray) -> None:
+        if not self._lossy:
+            last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
+            self._history.add(min(first, last), last, packet, time.monotonic())
+        self.packets += 1
+        self._transport.publish(self._key, packet, reliable=not self._lossy)
+
+    # -- the worker --------------------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                job = self._next_job()
+                if job is None:
+                    return
+            try:
+                job()
+            except TutelageError as error:
+                self._failure = error
+            except Exception:
+                log.exception("publisher of %s", self.alias)
+
+    def _next_job(self) -> Callable[[], None] | None:
+        """Wait until there is something to do; None: closed."""
+        while True:
+            now = time.monotonic()
+            if self._offers and not self._closing:
+                offers = list(self._offers)
+                self._offers.clear()
+                return lambda: self._answer(offers)
+            if not self._busy and self._queue and now >= self._free_at and not self._closing:
+                self._busy = True
+                batch = self._take()
+                return lambda: self._ship(batch)
+            if self._closing:
+                return None
+            if not self._busy and now >= self._anchor_at:
+                self._busy, self._anchor_at = True, float("inf")
+                return self._anchor
+            if not self._busy and now >= self._life_at:
+                self._busy = True
+                return self._show_life
+            until = min(self._anchor_at, self._life_at, self._free_at if self._queue else float("inf"))
+            if self._busy:  # whoever is busy looks after us
+                until = float("inf")
+            self._wakes_at = until
+            self._changed.wait(None if until == float("inf") else max(0.0, until - now))
+            self._wakes_at = float("-inf")
+
+    def _show_life(self) -> None:
+        try:
+            self._publish([frames.head(frames.Kind.LIFE, time.monotonic() - self._born)], time.time_ns())
+        except NoKey:
+            self._need_key()
+        finally:
+            pause = self._pause
+            self._idle()
+            with self._changed:
+                self._pause = min(2 * pause, LAST_LIFE)
+                self._life_at = time.monotonic() + self._pause if not self._lossy else float("inf")
+
+    def _anchor(self) -> None:
+        """Chain mode: confirm what was sent."""
+        try:
+            with self._sealing:
+                after = self._sealer.sequence + 1
+                packet = self._sealer.flush()
+                if packet is not None:
+                    self._hand_over(after, packet)
+        finally:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+
+    # -- what subscribers ask; on the transport's threads ------------------------------------------------------------------
+
+    def _on_hello(self, packet: bytes) -> None:
+        """Somebody does not know us: the next packet, at once, introduces us. Anyone may ask, so not often."""
+        now = time.monotonic()
+        with self._changed:
+            if now - self._greeted < GREETINGS or self._closing:
+                return
+            self._greeted = now
+            self._life_at = now
+            self._changed.notify_all()
+        self._sealer.introduce()
+
+    def _on_offer(self, packet: bytes) -> None:
+        with self._changed:
+            self._offers.append(packet)
+            self._changed.notify_all()
+
+    def _answer(self, offers: list[bytes]) -> None:
+        for offer in offers:
+            try:
+                with self._sealing:
+                    answer = self._sealer.accept_session(offer)
+            except Refused as refused:
+                self.refusals.add(refused.reason)
+            except NoKey:
+                self._need_key()
+            else:
+                self._transport.publish(self._answer_key, answer)
+        with self._changed:
+            self._life_at = time.monotonic()
+
+    def _replay(self, request: bytes) -> bytes | None:
+        try:
+            answer = self._history.answer(request)
+        except Refused as refused:
+            self.refusals.add(refused.reason)
+            return None
+        self.answered += 1
+        return answer

@@ -1,0 +1,177 @@
+"""Sessions: a key that only one sender and one receiver have, so that the other members of a topic cannot forge.
+
+The receiver offers, the sender answers: ephemeral X25519 both ways, signed by both nodes' own keys (SIGMA), hidden from
+carriers. From then on, packets carry for each session 16 bytes that only its two ends can make: AES-256-GCM's tag over
+header and ciphertext. Unlike a signature it convinces nobody else, and it costs a microsecond.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+from tutelage.sgc.access import Entry
+from tutelage.sgc.envelope import Curtain, derive
+from tutelage.sgc.grants import MAX_CONTROL, NONCE_BYTES, key_id
+from tutelage.sgc.home import Home
+from tutelage.sgc.packet import SESSION_TAG, TAG, Buffer, nonce
+from tutelage.sgc.reasons import Reason, Refused
+from tutelage.sgc.rules import Lane, Role
+from tutelage.sgc.signed import sign, verified
+from tutelage.sgc.trust import Member
+from tutelage.sgc.wire import pack, unpack
+
+OFFER = b"tutelage session offer 1"
+ANSWER = b"tutelage session answer 1"
+MAX_SESSIONS = 16
+SESSION_ID = 8
+SLOT = SESSION_ID + TAG
+_OFFER_SECONDS = 60.0
+_REMEMBERED = 256
+
+
+@dataclass(frozen=True)
+class Session:
+    """One established session.
+
+    Attributes:
+        ident: 8 bytes, in clear beside its tags.
+        member: the other end.
+        until: seconds since 1970, when the first of the two certificates expires.
+    """
+
+    ident: bytes
+    member: Member
+    until: float
+    cipher: AESGCM
+
+    def tag(self, header: bytes, sealed: Buffer) -> bytes:
+        """16 bytes over header and ciphertext, which are both in `sealed`."""
+        return self.cipher.encrypt(nonce(SESSION_TAG, header), b"", sealed)
+
+    def check(self, header: bytes, sealed: Buffer, tag: Buffer) -> None:
+        """Was the tag made by the other end?
+
+        Raises:
+            Refused: FORGED.
+        """
+        try:
+            self.cipher.decrypt(nonce(SESSION_TAG, header), tag, sealed)
+        except InvalidTag:
+            raise Refused(Reason.FORGED, f"a tag that is not by {self.member.node}") from None
+
+
+class Handshake:
+    """Offers and answers of one node on one topic and lane. Not for several threads at once."""
+
+    def __init__(self, home: Home, entry: Entry, lane: Lane) -> None:
+        self._home, self._entry, self._lane = home, entry, lane
+        self._offers = Curtain(entry.secret, OFFER + lane.encode())
+        self._answers = Curtain(entry.secret, ANSWER + lane.encode())
+        self._open: OrderedDict[bytes, tuple[X25519PrivateKey, float]] = OrderedDict()
+        self._seen: OrderedDict[bytes, None] = OrderedDict()
+
+    def offer(self) -> bytes:
+        """The receiver's first word. Good for a minute, and for any number of senders."""
+        ephemeral, now = X25519PrivateKey.generate(), time.time_ns()
+        body = pack(
+            self._entry.name,
+            secrets.token_bytes(NONCE_BYTES),
+            now.to_bytes(8, "big"),
+            ephemeral.public_key().public_bytes_raw(),
+        )
+        offer = self._offers.hide(pack(self._home.credential, sign(OFFER, body, self._home.signing_key)))
+        self._open[hashlib.sha256(offer).digest()] = ephemeral, now / 1e9
+        while len(self._open) > MAX_SESSIONS:
+            self._open.popitem(last=False)
+        return offer
+
+    def answer(self, offer: bytes, sender: bytes, salt: bytes) -> tuple[bytes, Session]:
+        """The sender's answer, and the session.
+
+        sender, salt: as in the header of the packets to come.
+
+        Raises:
+            Refused: not from a node that may receive; see the reason.
+        """
+        member, body = self._read(OFFER, self._offers, offer)
+        name, once, sent, public = unpack(body, 4)
+        now = time.time()
+        if name != self._entry.name or len(sent) != 8 or len(public) != 32:
+            raise Refused(Reason.MALFORMED, f"an offer of {member.node} for another topic")
+        if not self._entry.rule.may_receive(member.node, self._lane):
+            raise Refused(Reason.NOT_ALLOWED, f"{member.node} may not receive {self._entry.rule.alias}")
+        if abs(now - int.from_bytes(sent, "big") / 1e9) > _OFFER_SECONDS:
+            raise Refused(Reason.TOO_OLD, f"an offer of {member.node} from another time; check both clocks")
+        if once in self._seen:
+            raise Refused(Reason.REPLAYED, f"an offer of {member.node} that was answered before")
+        self._seen[once] = None
+        while len(self._seen) > _REMEMBERED:
+            self._seen.popitem(last=False)
+        ephemeral = X25519PrivateKey.generate()
+        ours = ephemeral.public_key().public_bytes_raw()
+        body = pack(name, hashlib.sha256(offer).digest(), ours, sender, salt)
+        session = self._session(ephemeral, public, body, member)
+        answer = self._answers.hide(pack(self._home.credential, sign(ANSWER, body, self._home.signing_key)))
+        return answer, session
+
+    def complete(self, answer: bytes) -> tuple[bytes, bytes, Session]:
+        """What the receiver makes of an answer: sender, salt, and the session.
+
+        Raises:
+            Refused: no answer to an open offer of ours, or not from a node that may send.
+        """
+        member, body = self._read(ANSWER, self._answers, answer)
+        name, offered, public, sender, salt = unpack(body, 5)
+        if name != self._entry.name or len(public) != 32 or len(salt) != 16:
+            raise Refused(Reason.MALFORMED, f"an answer of {member.node} for another topic")
+        if not self._entry.rule.may_send(member.node, self._lane):
+            raise Refused(Reason.NOT_ALLOWED, f"{member.node} may not send {self._entry.rule.alias}")
+        if sender != key_id(self._entry.secret, b"sender", member.signing):
+            raise Refused(Reason.FORGED, f"an answer of {member.node} in the name of another")
+        ephemeral, made = self._open.get(offered, (None, 0.0))
+        if ephemeral is None or time.time() - made > _OFFER_SECONDS:
+            raise Refused(Reason.REPLAYED, f"an answer of {member.node} to no open offer of ours")
+        return sender, salt, self._session(ephemeral, public, body, member)
+
+    def _read(self, context: bytes, curtain: Curtain, message: bytes) -> tuple[Member, bytes]:
+        if len(message) > MAX_CONTROL:
+            raise Refused(Reason.OVERSIZE, f"a handshake of {len(message)} bytes")
+        credential, statement = unpack(curtain.lift(bytes(message)), 2)
+        member = self._home.trust.verify(credential)
+        if member.role != Role.NODE:
+            raise Refused(Reason.NOT_ALLOWED, f"{member.node} is a router, and has no part in any topic")
+        return member, verified(context, statement, member.signing)
+
+    def _session(self, ours: X25519PrivateKey, theirs: bytes, body: bytes, member: Member) -> Session:
+        """Both ends sign the transcript: the answer names the offer by its digest, and the key is bound to the answer."""
+        try:
+            shared = ours.exchange(X25519PublicKey.from_public_bytes(theirs))
+        except ValueError:
+            raise Refused(Reason.MALFORMED, f"an impossible key of {member.node}") from None
+        material = derive(shared, hashlib.sha256(body).digest(), pack(b"tutelage session 1", self._lane.encode()), 40)
+        until = min(member.not_after, self._home.member.not_after)
+        return Session(material[32:], member, until, AESGCM(material[:32]))
+
+
+def tags(sessions: list[Session], header: bytes, sealed: Buffer) -> bytes:
+    """The proof of a packet: id and tag of every session."""
+    return b"".join(session.ident + session.tag(header, sealed) for session in sessions)
+
+
+def slots(proof: memoryview) -> list[tuple[bytes, memoryview]]:
+    """The sessions of a proof, with their tags.
+
+    Raises:
+        Refused: MALFORMED.
+    """
+    if len(proof) % SLOT or len(proof) > SLOT * MAX_SESSIONS:
+        raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
+    return [(bytes(proof[at : at + SESSION_ID]), proof[at + SESSION_ID : at + SLOT]) for at in range(0, len(proof), SLOT)]

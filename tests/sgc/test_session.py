@@ -1,0 +1,159 @@
+"""Sessions: pairwise keys, with whom they are made, and when they end."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from members import POLICY, Fleet
+
+from tutelage.sgc.errors import NotAllowed
+from tutelage.sgc.packet import MODES
+from tutelage.sgc.reasons import Reason, Refused
+from tutelage.sgc.session import MAX_SESSIONS
+
+
+@pytest.fixture
+def fleet(tmp_path) -> Fleet:
+    return Fleet(tmp_path, ["operator-1", "server", "drone-1", "operator-2"])
+
+
+def reason(call, *arguments, **named) -> Reason:
+    with pytest.raises(Refused) as raised:
+        call(*arguments, **named)
+    return raised.value.reason
+
+
+def test_each_receiver_has_a_session_of_its_own(fleet: Fleet) -> None:
+    sealer = fleet.sealer("operator-1", "teleop")
+    openers = [fleet.opener(name, "teleop") for name in ("server", "drone-1")]
+    for opener in openers:
+        assert opener.complete_session(sealer.accept_session(opener.offer_session())) == "operator-1"
+    assert sealer.receivers() == ["drone-1", "server"]
+    packet = sealer.seal(b"left")
+    assert [opener.open(packet).payload for opener in openers] == [b"left", b"left"]
+
+
+def test_without_a_session_a_packet_is_refused_and_says_so(fleet: Fleet) -> None:
+    sealer, opener = fleet.sealer("operator-1", "teleop"), fleet.opener("server", "teleop")
+    assert reason(opener.open, sealer.seal(b"x")) == Reason.NO_SESSION
+
+
+def test_a_restarted_sender_needs_a_new_session(fleet: Fleet) -> None:
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    opener.open(sealer.seal(b"x"))
+    again = fleet.sealer("operator-1", "teleop")
+    assert reason(opener.open, again.seal(b"x")) == Reason.NO_SESSION
+    opener.complete_session(again.accept_session(opener.offer_session()))
+    assert opener.open(again.seal(b"x")).payload == b"x"
+    assert opener.open(sealer.seal(b"x")).payload == b"x"
+
+
+def test_a_receiver_with_a_session_cannot_forge_for_another_receiver(fleet: Fleet) -> None:
+    """drone-1 knows the topic's key and its own session's; it makes a packet of operator-1's for server, tag and all."""
+    sealer, honest = fleet.pair("teleop", "operator-1", "server")
+    traitor = fleet.opener("drone-1", "teleop")
+    traitor.complete_session(sealer.accept_session(traitor.offer_session()))
+    forger = fleet.sealer("operator-1", "teleop")  # stands for drone-1 using the topic's key under operator-1's id and salt
+    forger.salt, forger.sequence = sealer.salt, sealer.sequence + 10
+    forger.seal(b"")
+    forger._sessions = list(traitor._sessions.values())
+    forged = forger.seal(b"stop everything")
+    assert traitor.open(forged).payload == b"stop everything"  # it can only fool itself
+    assert reason(honest.open, forged) == Reason.NO_SESSION
+    forger._sessions = [
+        type(own)(ident=other.ident, member=own.member, until=own.until, cipher=own.cipher)
+        for own, other in zip(traitor._sessions.values(), honest._sessions.values(), strict=True)
+    ]
+    assert reason(honest.open, forger.seal(b"stop everything")) == Reason.FORGED
+
+
+def test_only_receivers_may_offer_and_only_senders_may_answer(fleet: Fleet) -> None:
+    sealer = fleet.sealer("operator-1", "teleop")
+    stranger = fleet.opener("server", "teleop")
+    stranger._handshake._home = fleet.homes["operator-2"]  # it publishes, but does not subscribe
+    assert reason(sealer.accept_session, stranger.offer_session()) == Reason.NOT_ALLOWED
+    assert sealer.refusals[Reason.NOT_ALLOWED] == 1
+    opener, impostor = fleet.opener("server", "teleop"), fleet.sealer("operator-1", "teleop")
+    impostor._handshake._home = fleet.homes["drone-1"]
+    assert reason(opener.complete_session, impostor.accept_session(opener.offer_session())) == Reason.NOT_ALLOWED
+
+
+def test_an_answer_in_the_name_of_another_sender_is_refused(fleet: Fleet) -> None:
+    opener, impostor = fleet.opener("server", "teleop"), fleet.sealer("operator-1", "teleop")
+    impostor._handshake._home = fleet.homes["operator-2"]
+    assert reason(opener.complete_session, impostor.accept_session(opener.offer_session())) == Reason.FORGED
+
+
+def test_a_repeated_offer_is_refused(fleet: Fleet) -> None:
+    sealer, opener = fleet.sealer("operator-1", "teleop"), fleet.opener("server", "teleop")
+    offer = opener.offer_session()
+    sealer.accept_session(offer)
+    assert reason(sealer.accept_session, offer) == Reason.REPLAYED
+    assert sealer.receivers() == ["server"]
+
+
+def test_an_old_offer_is_refused(fleet: Fleet, monkeypatch) -> None:
+    sealer, opener = fleet.sealer("operator-1", "teleop"), fleet.opener("server", "teleop")
+    offer, now = opener.offer_session(), time.time()
+    answer = sealer.accept_session(offer)
+    monkeypatch.setattr("tutelage.sgc.session.time.time", lambda: now + 100)
+    assert reason(fleet.sealer("operator-1", "teleop").accept_session, offer) == Reason.TOO_OLD
+    assert reason(opener.complete_session, answer) == Reason.REPLAYED
+
+
+def test_an_answer_to_somebody_elses_offer_is_refused(fleet: Fleet) -> None:
+    sealer = fleet.sealer("operator-1", "teleop")
+    one, other = fleet.opener("server", "teleop"), fleet.opener("server", "teleop")
+    assert reason(other.complete_session, sealer.accept_session(one.offer_session())) == Reason.REPLAYED
+
+
+@pytest.mark.parametrize("which", ["offer", "answer"])
+def test_a_handshake_with_a_changed_byte_is_refused(fleet: Fleet, which: str) -> None:
+    sealer, opener = fleet.sealer("operator-1", "teleop"), fleet.opener("server", "teleop")
+    offer = opener.offer_session()
+    message = bytearray(offer if which == "offer" else sealer.accept_session(offer))
+    take = sealer.accept_session if which == "offer" else opener.complete_session
+    for at in range(0, len(message), 7):
+        message[at] ^= 1
+        assert reason(take, bytes(message)) == Reason.TAMPERED
+        message[at] ^= 1
+    for wrong in (b"", b"x" * 20, bytes(1 << 20)):
+        assert reason(take, wrong) in (Reason.MALFORMED, Reason.OVERSIZE)
+
+
+def test_sessions_are_few_and_those_of_one_node_do_not_push_out_others(fleet: Fleet) -> None:
+    sealer = fleet.sealer("operator-1", "teleop")
+    quiet = fleet.opener("drone-1", "teleop")
+    quiet.complete_session(sealer.accept_session(quiet.offer_session()))
+    for _ in range(3 * MAX_SESSIONS):
+        sealer.accept_session(fleet.opener("server", "teleop").offer_session())
+    assert sealer.receivers() == ["drone-1", "server"]
+    assert quiet.open(sealer.seal(b"x")).payload == b"x"
+    assert len(sealer._sessions) == 3
+
+
+def test_a_session_ends_with_the_certificate_and_with_revocation(fleet: Fleet) -> None:
+    sealer, opener = fleet.pair("teleop", "operator-2", "server")
+    opener.open(sealer.seal(b"x"))
+    other = fleet.opener("drone-1", "teleop")
+    other.complete_session(sealer.accept_session(other.offer_session()))
+    fleet.revoke("drone-1", tell=["operator-2"])
+    opener.open(sealer.seal(b"x"))
+    assert sealer.receivers() == ["server"]
+    fleet.revoke("operator-2", tell=["server"])
+    assert reason(opener.open, sealer.seal(b"x")) == Reason.REVOKED
+
+
+def test_a_session_ends_when_the_policy_says_so(fleet: Fleet) -> None:
+    sealer, _ = fleet.pair("teleop", "operator-1", "server")
+    fleet.publish(POLICY.replace('subscribe = ["drone-1", "server"]', 'subscribe = ["drone-1"]'))
+    sealer.seal(b"x")
+    assert sealer.receivers() == []
+
+
+def test_other_topics_have_no_sessions(fleet: Fleet) -> None:
+    offer = fleet.opener("server", "teleop").offer_session()
+    with pytest.raises(NotAllowed, match='camera has authenticity "signature" in the policy, so it has no sessions'):
+        fleet.sealer("drone-1", "camera").accept_session(offer)
+    assert len(set(MODES.values())) == 3
