@@ -1,4 +1,4 @@
-"""Robot steps a second of the tasks that nobody else has as a fleet, and images a second of those that are seen from above."""
+"""Robot steps a second of the tasks that only we have as fleets, and images a second of those that are seen from above."""
 
 from __future__ import annotations
 
