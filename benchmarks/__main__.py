@@ -10,7 +10,9 @@ from pathlib import Path
 from benchmarks.pages import RESULTS, renew
 from benchmarks.timing import machine
 
-NAMES = ("loop", "allocation", "engine", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies")
+NAMES = (
+    "loop", "allocation", "engine", "tasks", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies"
+)  # fmt: skip
 
 
 def main() -> None:
