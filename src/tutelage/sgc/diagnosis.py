@@ -89,7 +89,10 @@ class Diagnosis:
     def _found(self, connected: bool) -> list[str]:
         name = self._home.name
         if not connected:
-            return [f"{name} reaches none of the routers of its network.toml, and goes on trying: do they run there?"]
+            return [
+                f"{name} reaches none of the routers of its network.toml, and goes on trying: do they run, and at an address "
+                "that their certificate names (tutelage keys init --router NAME --address ADDRESS)?"
+            ]
         with self._lock:
             unknown = self._unknown
         remedy = "give it the newest bundle: tutelage keys renew ROUTER --bundle FLEET/outbox/ROUTER.bundle"
