@@ -90,8 +90,8 @@ class Diagnosis:
         name = self._home.name
         if not connected:
             return [
-                f"{name} reaches none of the routers of its network.toml, and goes on trying: do they run, and at an address "
-                "that their certificate names (tutelage keys init --router NAME --address ADDRESS)?"
+                f"{name} reaches none of the routers of its network.toml, and goes on trying: do they run, at an "
+                "address that their certificate names (tutelage keys init --router NAME --address ADDRESS)?"
             ]
         with self._lock:
             unknown = self._unknown

@@ -64,8 +64,10 @@ class History:
                 self._held -= len(self._packets.popleft()[3])
 
     def find(self, ranges: Iterable[tuple[int, int]], size: int = ANSWER) -> tuple[int, list[bytes | bytearray]]:
-        """The lowest sequence number kept, and the packets with messages in the ranges, oldest first, up to `size` bytes, plus
-        the one that confirms them."""
+        """The lowest sequence number kept, and the packets with messages in the ranges, oldest first, up to `size` bytes.
+
+        If these are worth nothing without a later one in the ranges, that one, too.
+        """
         with self._lock:
             kept = list(self._packets)
         found: list[bytes | bytearray] = []

@@ -71,7 +71,8 @@ class Publisher:
         self._answer_key = lanes.key(entry.name, lanes.ANSWER)
         self._history = History(max_age=entry.rule.max_age)
         self._born = time.monotonic()
-        self._changed = threading.Condition(threading.Lock())
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
         self._queue: deque[tuple[bytes, int]] = deque()  # with the time at which it was sent, nanoseconds since 1970
         self._queued = 0
         self._offers: deque[bytes] = deque(maxlen=64)
@@ -79,7 +80,7 @@ class Publisher:
         self._busy = False
         self._closing = False
         self._failure: TutelageError | None = None
-        self._flushing = 0
+        self._waiting = 0
         self._free_at = self._greeted = 0.0
         self._wakes_at = float("-inf")
         session = entry.rule.authenticity == Authenticity.SESSION
@@ -112,7 +113,7 @@ class Publisher:
         if len(payload) > frames.MAX_MESSAGE:
             raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {len(payload):,} bytes")
         sent = time.time_ns()
-        with self._changed:
+        with self._lock:
             self._check()
             alone = not self._busy and not self._queue and len(payload) <= INLINE and time.monotonic() >= self._free_at
             if alone:
@@ -126,11 +127,7 @@ class Publisher:
     def flush(self, timeout: float) -> bool:
         """Wait until everything queued has been handed to the transport; False: it was not within `timeout` seconds."""
         with self._changed:
-            self._flushing += 1
-            try:
-                return self._changed.wait_for(lambda: not self._queue and not self._busy, timeout)
-            finally:
-                self._flushing -= 1
+            return self._wait(lambda: not self._queue and not self._busy, timeout)
 
     def close(self) -> None:
         """Send what is queued (at most a second), then stop."""
@@ -179,10 +176,8 @@ class Publisher:
             self._queue.clear()
             self._queued = 0
 
-        def room() -> bool:
-            return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._queued + len(payload) <= QUEUE_BYTES)
-
-        if not room() and not (wait > 0 and self._changed.wait_for(lambda: self._closing or room(), wait)):
+        size = len(payload)
+        if not self._room(size) and not self._wait(lambda: self._closing or self._room(size), wait):
             self.congested += 1
             raise Congested(
                 f"the queue of {self.alias} is full ({len(self._queue)} messages): the network is slower than the sender; "
@@ -190,8 +185,20 @@ class Publisher:
             )
         self._check()
         self._queue.append((payload, sent))
-        self._queued += len(payload)
-        self._changed.notify_all()
+        self._queued += size
+        if len(self._queue) == 1:  # else the worker knows that there is something to send
+            self._changed.notify_all()
+
+    def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
+        """Until the worker or whoever sends has brought it about."""
+        self._waiting += 1
+        try:
+            return self._changed.wait_for(condition, timeout)
+        finally:
+            self._waiting -= 1
+
+    def _room(self, size: int) -> bool:
+        return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._queued + size <= QUEUE_BYTES)
 
     def _take(self) -> list[tuple[bytes, int]]:
         """What goes out next: small messages together, a large one alone. A packet has the age of its oldest message."""
@@ -236,7 +243,7 @@ class Publisher:
 
     def _idle(self) -> None:
         now = time.monotonic()
-        with self._changed:
+        with self._lock:
             self._busy = False
             self._free_at = max(self._free_at, now + self._spacing)
             self._pause = FIRST_LIFE
@@ -244,7 +251,7 @@ class Publisher:
             if self._chain:
                 self._anchor_at = min(self._anchor_at, now + self._anchor_every)
             # The worker is woken only if it must do something sooner than it thinks: a wake costs more than a small message.
-            if self._queue or self._flushing or min(self._life_at, self._anchor_at) < self._wakes_at:
+            if self._queue or self._waiting or min(self._life_at, self._anchor_at) < self._wakes_at:
                 self._changed.notify_all()
 
     def _publish(self, payloads: list[bytes], sent: int) -> None:

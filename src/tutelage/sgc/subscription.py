@@ -320,13 +320,13 @@ class Subscription:
             self._refused(refused.reason, received, packet)
             return []
         self.packets += 1
-        messages: list[Message] = []
-        now = time.monotonic()
+        ready: list[Opened] = []
+        accept, now = self.delivery.accept, time.monotonic()
         for each in opened:
-            messages += self._messages(self.delivery.accept(each, now), received)
+            ready += accept(each, now)
         if opened:
             self._heard(opened[-1], received)
-        return messages
+        return self._messages(ready, received)
 
     def _heard(self, opened: Opened, received: float) -> None:
         sender, took = opened.sender, received - opened.sent * 1e-9
@@ -370,7 +370,7 @@ class Subscription:
             if assembly is None:
                 assembly = self._begin(each)
             try:
-                payload = assembly.add(each.sequence, frames.parse(each.payload))
+                payload = assembly.take(each.sequence, each.payload)
             except Refused as refused:
                 self.opener.refusals.add(refused.reason)
                 continue
