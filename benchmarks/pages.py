@@ -123,18 +123,19 @@ def proxy_rates(results: Results) -> str:
     )
 
 
-TABLES: dict[str, Callable[[Results], str]] = {
-    "machines": machines,
-    "targets": targets,
-    "round-trips": round_trips,
-    "ratios": ratios,
-    "directory": directory,
-    "start": start,
-    "wan": wan,
-    "sealing": sealing,
-    "proxies": proxies,
-    "proxy-rates": proxy_rates,
+TABLES: dict[str, tuple[str, Callable[[Results], str]]] = {
+    "machines": ("", machines),
+    "targets": ("connectivity", targets),
+    "round-trips": ("connectivity", round_trips),
+    "ratios": ("connectivity", ratios),
+    "directory": ("connectivity", directory),
+    "start": ("connectivity", start),
+    "wan": ("connectivity", wan),
+    "sealing": ("sealing", sealing),
+    "proxies": ("proxies", proxies),
+    "proxy-rates": ("proxies", proxy_rates),
 }
+"""By name, each with the benchmark whose results it needs."""
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
@@ -143,13 +144,21 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 def render(page: str, results: Results) -> str:
     """The page with the tables of these results."""
-    return PLACE.sub(lambda place: f"{place[1]} -->\n\n{TABLES[place[1]](results)}\n\n", page)
+
+    def fill(place: re.Match[str]) -> str:
+        benchmark, make = TABLES[place[1]]
+        return f"{place[1]} -->\n\n{make(results)}\n\n" if not benchmark or benchmark in results else place[0]
+
+    return PLACE.sub(fill, page)
 
 
 def renew(*, check: bool = False) -> bool:
-    """Write the page; with `check` only compare. Was it as it should be?"""
-    names = ("connectivity", "sealing", "proxies")
-    results = {name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in names}
+    """Write the page; with `check` only compare. Was it as it should be?
+
+    A table whose benchmark has no results yet stays as it is.
+    """
+    files = {name: RESULTS / f"{name}.json" for name in ("connectivity", "sealing", "proxies")}
+    results = {name: json.loads(file.read_text(encoding="utf-8")) for name, file in files.items() if file.exists()}
     before = PAGE.read_text(encoding="utf-8")
     after = render(before, results)
     if not check:

@@ -66,9 +66,9 @@ def run(quick: bool = False) -> dict[str, Any]:
     """Round trips in milliseconds, and messages a second."""
     os.environ["CYCLONEDDS_URI"] = CYCLONE.format(tag=f"benchmark-{os.getpid()}")
     with tempfile.TemporaryDirectory() as folder, _network(Path(folder)):
-        latency = _latency(20 if quick else 200)
-        floods = _floods(3 if quick else 9)
-        bridges = _rosbridge(Path(folder), 3 if quick else 9)
+        latency = _latency(20 if quick else 100)
+        floods = _floods(3 if quick else 5)
+        bridges = _rosbridge(Path(folder), 3 if quick else 5)
     head = ["round trip, ms", "direct p50", "p99", "router p50", "p99", "router / direct"]
     columns = ("direct_p50", "direct_p99", "router_p50", "router_p99", "ratio")
     print(table(head, [[f"{result['bytes']:,} B", *(result[column] for column in columns)] for result in latency]))
