@@ -9,10 +9,9 @@ import time
 from collections.abc import Iterator
 from types import FrameType
 
-
 LOOK = 0.2
-"""Seconds. The system may give a signal to any thread, such as one of Zenoh's; Python then deals with it only when the main thread
-wakes."""
+"""Seconds. The system may give a signal to any thread, such as one of Zenoh's; Python then deals with it only when the main
+thread wakes."""
 
 
 class Stop(threading.Event):
