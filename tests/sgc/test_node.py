@@ -114,6 +114,28 @@ def test_iterating_over_a_subscription(arm: Node, server: Node) -> None:
     assert list(subscription) == []
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_a_direct_subscription_gets_the_same_on_the_networks_thread(
+    network: Network, arm: Node, server: Node, mode: str
+) -> None:
+    got, threads = Received(), set[str]()
+    server.subscribe(f"log-{mode}", lambda m: (threads.add(threading.current_thread().name), got(m))[0], direct=True)
+    log = arm.publisher(f"log-{mode}")
+    acquainted(log.send, got)
+    threads.clear()
+    for k in range(300):
+        network.up = not 100 <= k < 150  # what is lost is fetched again
+        log.send(b"%d" % k)
+        log.flush(1.0)
+    eventually(lambda: in_order(got, 300))
+    assert any(not name.startswith("sgc-subscribe") for name in threads)
+
+
+def test_a_direct_subscription_needs_a_callback(server: Node) -> None:
+    with pytest.raises(ConfigError, match="a direct subscription of log-signature needs a callback"):
+        server.subscribe("log-signature", direct=True)
+
+
 def test_messages_wait_for_the_key_until_its_owner_is_there(tmp_path: Path, network: Network) -> None:
     fleet = Fleet(tmp_path, POLICY, ["arm", "server"])
     with Node.open(fleet["server"], MemoryTransport(network)) as server:
