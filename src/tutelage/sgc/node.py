@@ -44,6 +44,9 @@ TEND = 0.5
 """Seconds between two looks at keys and files."""
 
 
+LAST_WORDS = 1.0
+"""Seconds for which `close` waits for questions that are under way."""
+
 GOSSIP = 10.0
 """Seconds after which the deny list is passed on again."""
 
@@ -241,6 +244,7 @@ class Node:
             self._thread.join(2.0)
         if self._own_transport:
             self.transport.close()
+        self._pool.join(LAST_WORDS)
 
     def __enter__(self) -> Self:
         return self

@@ -177,6 +177,7 @@ class ZenohTransport(Transport):
         for tunnel in self._tunnels.values():
             tunnel.close()
         self._pool.close()
+        self._pool.join(1.0)
 
     # -- connecting ---------------------------------------------------------------------------------------------------------
 
