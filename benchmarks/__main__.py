@@ -1,4 +1,4 @@
-"""`python -m benchmarks [name...] [--quick]`: run benchmarks, print tables, write results/benchmarks/<name>.json."""
+"""`python -m benchmarks [name...] [--quick]`: run, print tables, write results/benchmarks/<name>.json and pages' tables."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import importlib
 import json
 from pathlib import Path
 
+from benchmarks.pages import RESULTS, renew
 from benchmarks.timing import machine
 
 NAMES = (
-    "loop", "allocation", "engine", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies",
+    "loop", "allocation", "engine", "tasks", "gates", "images", "memory", "robosuite", "sealing", "connectivity", "proxies",
     "console", "fleet_step",
 )  # fmt: skip
 
@@ -34,6 +35,8 @@ def main() -> None:
         given.out.mkdir(parents=True, exist_ok=True)
         path = given.out / f"{name}.json"
         path.write_text(json.dumps({"machine": where, "quick": given.quick, **result}, indent=1) + "\n", encoding="utf-8")
+    if given.out.resolve() == RESULTS:
+        renew()
 
 
 if __name__ == "__main__":

@@ -116,11 +116,15 @@ def test_report(tut: Callable[..., Said], folder: Path, tmp_path: Path) -> None:
     assert "C.U.R." in said.out
 
 
-def test_info(tut: Callable[..., Said]) -> None:
+def test_info(tut: Callable[..., Said], monkeypatch: pytest.MonkeyPatch) -> None:
     tasks = tut("info").out
     assert tasks == tut("info", "tasks").out
     assert re.search(r"^ Walker2d +17 +6 +1000 +moderate +expert +\d+ \(published 3492\) +\d+% of 100 ", tasks, re.MULTILINE)
     assert [line.split()[0] for line in tasks.splitlines()[1:]] == [*TASKS]
+    monkeypatch.setattr(cli, "_speed", lambda task: "12,345")
+    measured = tut("info", "tasks", "--speed").out
+    assert re.search(r"steps/s here +what *$", measured.splitlines()[0])
+    assert all(" 12,345 " in line for line in measured.splitlines() if line.split()[0] in TASKS)
     levels = tut("info", "levels").out
     assert [line.split()[0] for line in levels.splitlines()] == [
         "level", "none", "mild", "light", "moderate", "strong", "severe", "extreme",

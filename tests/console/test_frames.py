@@ -45,6 +45,15 @@ class TestWatching:
             server.wait(lambda: look(server, 0).time > first.time)
             assert abs(look(server, 0).time - time.time()) < 1.0
 
+    def test_also_while_the_simulation_waits_for_people(self, tmp_path: Path) -> None:
+        with Serving(pushing(tmp_path, lockstep=True)) as server:
+            server.of.join("ann")
+            server.of.take("ann", 2)
+            server.wait(lambda: 2 in server.now.leases)
+            t = server.now.t
+            assert look(server, 2).rgb.shape == (48, 64, 3)
+            assert server.now.t <= t + 1
+
     def test_several_sizes_at_once(self, tmp_path: Path) -> None:
         with Serving(pushing(tmp_path)) as server:
             assert look(server, 0, 32, 24).rgb.shape == (24, 32, 3)

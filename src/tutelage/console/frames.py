@@ -228,9 +228,17 @@ class Frames:
             for key in [k for k, asked in self._watched.items() if now - asked > WATCHED]:
                 del self._watched[key]
                 self._frames.pop(key, None)
-            robots = sorted({robot for robot, _, _ in self._watched})
-        if not robots:
+            self._states = {}
+        self.look()
+
+    def look(self) -> None:
+        """Copy what somebody began to watch since the last timestep (in the loop's thread, between two of them)."""
+        if self.painter is None:
             return
+        with self._changed:
+            robots = sorted({robot for robot, _, _ in self._watched})
+            if all(robot in self._states for robot in robots):
+                return
         states, taken = self.painter.copy(np.array(robots)), time.time()
         with self._changed:
             self._states = {robot: (taken, state) for robot, state in zip(robots, states, strict=True)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from tutelage.console.states import Notice
@@ -23,6 +24,8 @@ class Pace:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
+        self.meanwhile: Callable[[], None] = lambda: None
+        """Called now and then while no timestep comes."""
         self.began, self.worked = time.perf_counter(), 0.0
         """When the timestep began, and the CPU time of the loop's thread then, s."""
         self._due = 0.0
@@ -62,7 +65,8 @@ class Pace:
         engine = self._engine
         with engine.lock:
             while not engine.closing and (left := due - engine.clock()) > 0:
-                engine.lock.wait(left)
+                engine.lock.wait(min(left, SHOW))
+                self.meanwhile()
                 if engine.publish():
                     engine.show()
 
@@ -73,6 +77,7 @@ class Pace:
         with engine.lock:
             while not engine.closing and engine.clock() < deadline and engine.people.waiting_for():
                 engine.lock.wait(0.1)
+                self.meanwhile()
                 engine.offers.tick(engine.clock())
                 if engine.publish() or engine.clock() - shown > SHOW:
                     engine.show()
@@ -86,6 +91,7 @@ class Pace:
         while not engine.closing:
             with engine.lock:
                 engine.lock.wait(0.25)
+                self.meanwhile()
                 engine.offers.tick(engine.clock())
                 engine.publish()
                 engine.show()

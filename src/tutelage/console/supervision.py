@@ -54,6 +54,7 @@ class Supervision:
         self._frames = Frames(engine.parts.fleet.inner, engine.config.hz)
         self._replay = Replay(engine, self._frames) if engine.config.replay else None
         engine.recording.watchers.append(self._frames.on_step)
+        engine.pace.meanwhile = self._frames.look
         if self._replay:
             engine.recording.watchers.append(self._replay.on_step)
 

@@ -6,6 +6,7 @@ from tutelage.envs.tasks.ball_balance import BallBalance
 from tutelage.envs.tasks.base import ArrayTask, GoalTask, MujocoTask, Task
 from tutelage.envs.tasks.block_pushing import BlockPushing, ObstaclePushing
 from tutelage.envs.tasks.cable_routing import CableRouting
+from tutelage.envs.tasks.franka_cube_stack import FrankaCubeStack
 from tutelage.envs.tasks.half_cheetah import HalfCheetah
 from tutelage.envs.tasks.humanoid import Humanoid
 from tutelage.envs.tasks.navigation import Navigation
@@ -26,6 +27,7 @@ TASKS: dict[str, type[Task]] = {
         BlockPushing,
         ObstaclePushing,
         BallBalance,
+        FrankaCubeStack,
     )
 }
 MUJOCO: dict[str, type[MujocoTask]] = {name: task for name, task in TASKS.items() if issubclass(task, MujocoTask)}
