@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response
@@ -15,7 +16,7 @@ from tutelage.console.chain import Row
 from tutelage.console.context import at_least, context_of, has_webrtc, local, session_of
 from tutelage.console.messages import Robot
 from tutelage.console.pictures import jpeg
-from tutelage.console.plain import parsed, plain
+from tutelage.console.plain import parsed, plain, text
 from tutelage.console.verifying import verify_apart
 
 router = APIRouter()
@@ -32,6 +33,12 @@ class Which(BaseModel):
     robot: Robot | None
 
 
+async def _answer(request: Request, call: Callable[[], Any]) -> Response:
+    """What `call` returns as JSON. All of it is done in a thread: thousands of rows would hold up the sockets."""
+    content = await context_of(request).slow.run(lambda: text(plain(call())))
+    return Response(content, media_type="application/json")
+
+
 @router.get("/api/fleet")
 def fleet(request: Request, who: Anybody) -> dict[str, Any]:
     """What is supervised."""
@@ -45,10 +52,10 @@ def describe(app: Any) -> dict[str, Any]:
 
 
 @router.get("/api/metrics")
-async def metrics(request: Request, who: Anybody, since: Annotated[int, Query(ge=0, lt=2**53)] = 0) -> dict[str, Any]:
+async def metrics(request: Request, who: Anybody, since: Annotated[int, Query(ge=0, lt=2**53)] = 0) -> Response:
     """Rows of metrics after timestep `since`."""
-    c = context_of(request)
-    return {"rows": plain(await c.slow.run(c.supervision.metrics, since))}
+    supervision = context_of(request).supervision
+    return await _answer(request, lambda: {"rows": supervision.metrics(since)})
 
 
 @router.get("/api/operators")
@@ -70,12 +77,15 @@ async def audit(
     kind: Annotated[str | None, Query(max_length=32)] = None,
     person: Annotated[str | None, Query(max_length=64, alias="who")] = None,
     robot: Annotated[int | None, Query(ge=0, lt=2**31)] = None,
-) -> dict[str, Any]:
+) -> Response:
     """The newest rows of the record."""
-    c = context_of(request)
-    rows = await c.slow.run(c.audit.rows, before, limit, kind or None, person or None, robot)
-    head = await c.slow.run(c.audit.head)
-    return {"rows": [_row(row) for row in rows], "head": {"rows": head.rows, "hash": head.hash.hex()}}
+    record = context_of(request).audit
+
+    def read() -> dict[str, Any]:
+        rows, head = record.rows(before, limit, kind or None, person or None, robot), record.head()
+        return {"rows": [_row(row) for row in rows], "head": {"rows": head.rows, "hash": head.hash.hex()}}
+
+    return await _answer(request, read)
 
 
 @router.get("/api/audit/verify")
@@ -94,17 +104,17 @@ def _row(row: Row) -> dict[str, Any]:
 
 
 @router.get("/api/episodes")
-async def episodes(request: Request, who: Anybody, limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> dict[str, Any]:
+async def episodes(request: Request, who: Anybody, limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> Response:
     """Recorded interventions, newest first."""
-    c = context_of(request)
-    return {"rows": plain(await c.slow.run(c.supervision.episodes, limit))}
+    supervision = context_of(request).supervision
+    return await _answer(request, lambda: {"rows": supervision.episodes(limit)})
 
 
 @router.get("/api/episodes/{id}")
-async def episode(request: Request, who: Anybody, id: Id) -> Any:
+async def episode(request: Request, who: Anybody, id: Id) -> Response:
     """One of them."""
-    c = context_of(request)
-    return plain(await c.slow.run(c.supervision.episode, id))
+    supervision = context_of(request).supervision
+    return await _answer(request, lambda: supervision.episode(id))
 
 
 @router.get("/api/episodes/{id}/frames/{k}.jpg")

@@ -81,9 +81,9 @@ class LiveSocket(Socket):
         supervision = self.context.supervision
         no_seat = await self.hub.join(self)
         newest = supervision.snapshot()
-        rows = await self.context.slow.run(supervision.metrics, max(0, newest.t - 10**9))
+        rows = await self.context.slow.run(lambda: plain(supervision.metrics()[-HISTORY:]))
         me = {"name": self.name, "role": self.session.role.name.lower(), "seat": self.hub.seats.get(self.name)}
-        hello = {"type": "hello", "me": me, "fleet": describe(self.websocket.app), "metrics": plain(rows[-HISTORY:])}
+        hello = {"type": "hello", "me": me, "fleet": describe(self.websocket.app), "metrics": rows}
         hello["study"] = self.context.study.state() if self.context.study else None
         standing = [text(message_of(event)) for event in supervision.standing(self.name)]
         # What was told while it joined comes after hello, and may be among what stands.
