@@ -56,7 +56,8 @@ def robot(
     from tutelage.remote.driver import make_driver
     from tutelage.remote.robot import DriverFailed, Robot, RobotConfig
     from tutelage.sgc.commands.stopping import until_stopped
-    from tutelage.sgc.health import HealthServer, node_health
+    from tutelage.sgc.health import node_health
+    from tutelage.sgc.health_server import HealthServer
     from tutelage.sgc.node import Node
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
