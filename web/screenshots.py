@@ -2,8 +2,8 @@
 
     python web/screenshots.py [--fleet sim:PegInsertion] [--robots 12] [--seconds 60] [--out web/shots]
 
-Starts `tutelage serve` in a temporary folder, lets two programs help as operators for a while so that there is something to see,
-and takes over a robot itself. Needs Chromium and playwright.
+Starts `tutelage serve` in a temporary folder, lets two programs work as operators for a while, so that there is something to
+see, and takes over a robot itself. Needs Chromium and playwright.
 """
 
 from __future__ import annotations
@@ -104,20 +104,32 @@ def shoot(browser: Any, origin: str, out: Path, size: str, scheme: str) -> None:
     somebody.go(f"/robot/{max(0, robot)}")
     page.wait_for_timeout(1500)
     save("robot")
-    with contextlib.suppress(Exception):
-        page.get_by_role("button", name="Take over").or_(page.locator(".panel .button.primary")).last.click(timeout=3000)
-        page.wait_for_selector(".stage-mine", timeout=5000)
-        page.locator(".view").focus()
-        page.keyboard.down("ArrowRight")
-        page.wait_for_timeout(900)
-        save("drive")
-        page.keyboard.up("ArrowRight")
-        page.keyboard.press("h")
-        page.wait_for_timeout(400)
-        save("reset")
-        page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
-        page.keyboard.press("g")
-        page.wait_for_timeout(800)
+    for _ in range(6):  # a robot may be done before the picture is taken
+        with contextlib.suppress(Exception):
+            page.locator(".panel .button.primary").click(timeout=3000)
+            page.wait_for_selector(".stage-mine", timeout=4000)
+            page.locator(".view").focus()
+            page.keyboard.down("ArrowRight")
+            page.wait_for_selector(".kbd-on, .stick-on", timeout=2000)
+            page.wait_for_selector(".offer", state="detached", timeout=2000)
+            page.wait_for_timeout(400)
+            driven = page.locator(".stage-mine .view-live").count()
+            save("drive")
+            page.keyboard.up("ArrowRight")
+            page.get_by_role("button", name="Hard reset").click(timeout=2000)
+            page.wait_for_timeout(400)
+            save("reset")
+            page.get_by_role("dialog").get_by_role("button", name="Cancel").click(timeout=2000)
+            page.get_by_role("button", name="Give back").click(timeout=2000)
+            if driven:
+                break
+        somebody.go("/")
+        page.wait_for_timeout(1000)
+        robot = page.evaluate(
+            f"() => [...document.querySelectorAll('.tile')].findLastIndex((tile) => tile.matches('{UNTENDED}'))"
+        )
+        somebody.go(f"/robot/{max(0, robot)}")
+        page.wait_for_timeout(1000)
     for line in somebody.complaints:
         print(f"{size} {scheme}: {line}", file=sys.stderr)
     somebody.close()

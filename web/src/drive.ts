@@ -214,6 +214,16 @@ export function followLease(): void {
   });
 }
 
+/** The first of some keys that does not drive the robots of this task: a shortcut that always works. */
+export function freeKey(...codes: string[]): string {
+  const which = controls();
+  const taken = which ? driveKeys(which) : new Set<string>();
+  return codes.find((code) => !taken.has(code)) ?? "";
+}
+
+export const giveBackKey = (): string => freeKey("KeyG", "KeyB", "KeyY");
+export const resetKey = (): string => freeKey("KeyH", "KeyN", "KeyU");
+
 /** Whether a key drives the robot now and so is no shortcut. */
 export function isDriveKey(code: string): boolean {
   const which = controls();

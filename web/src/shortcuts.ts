@@ -1,7 +1,7 @@
 /** Keys that work everywhere. Esc is for danger: once stops the robot that one drives, twice stops all. */
 
 import { giveBack, takeOver, decline } from "./live";
-import { isDriveKey } from "./drive";
+import { giveBackKey, isDriveKey, resetKey } from "./drive";
 import { askReset } from "./pages/Stage";
 import { emergencyStop } from "./stop";
 import * as store from "./store";
@@ -29,12 +29,12 @@ function letter(event: KeyboardEvent): void {
   if ((event.target as HTMLElement | null)?.closest?.("input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select, dialog")) return;
   const first = store.offers.value.keys().next().value;
   // In the study, going to the robots accepts, and the algorithm gives them back.
-  if (store.study.value?.interface === "game" && event.code !== "KeyH") return;
+  if (store.study.value?.interface === "game" && event.code !== resetKey()) return;
   const driven = store.lease.value?.robot;
   if (event.code === "KeyA" && first !== undefined && driven === undefined) void takeOver(first);
   else if (event.code === "KeyD" && first !== undefined && driven === undefined) void decline(first);
-  else if (event.code === "KeyG" && driven !== undefined) void giveBack(driven);
-  else if (event.code === "KeyH" && driven !== undefined && store.robots.value[driven]?.value.mode !== Mode.RESETTING) askReset(driven);
+  else if (event.code === giveBackKey() && driven !== undefined) void giveBack(driven);
+  else if (event.code === resetKey() && driven !== undefined && store.robots.value[driven]?.value.mode !== Mode.RESETTING) askReset(driven);
   else return;
   event.preventDefault();
 }

@@ -1,3 +1,4 @@
+import { columnsFor } from "../src/fit";
 import { describe, expect, it } from "vitest";
 import { choose, sizeFor, type Wish } from "../src/streams";
 
@@ -27,5 +28,15 @@ describe("what is watched", () => {
     expect(sizeFor(150, 1)).toEqual([160, 90]);
     expect(sizeFor(240, 2)).toEqual([640, 360]);
     expect(sizeFor(4000, 3)).toEqual([960, 540]);
+  });
+});
+
+describe("the wall", () => {
+  it("is as large as fits without scrolling, and never too small to see", () => {
+    expect(columnsFor(1, 1100, 780)).toBe(1);
+    expect(columnsFor(12, 1100, 780)).toBe(4);
+    expect(columnsFor(4, 1100, 780)).toBe(2);
+    expect(columnsFor(100, 1100, 780)).toBe(5);
+    expect(columnsFor(100, 200, 780)).toBe(1);
   });
 });

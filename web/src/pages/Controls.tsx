@@ -55,6 +55,11 @@ function stickOf(controls: Description): [number, number] | null {
   return null;
 }
 
+/** A drag on the controls is not a fling of the page: after one, the browser would swallow the next tap, on whatever it is. */
+export function noGesture(event: Event): void {
+  event.preventDefault();
+}
+
 function AxisRow({ axis, k }: { axis: Axis; k: number }) {
   const value = held.value.values[k] ?? 0;
   const [low = "", high = ""] = axis.keys;
@@ -101,6 +106,7 @@ function Stick({ x, y, controls }: { x: number; y: number; controls: Description
       ref={base}
       class="stick"
       aria-hidden="true"
+      onTouchStart={noGesture}
       onPointerDown={(event) => {
         event.preventDefault();
         base.current?.setPointerCapture(event.pointerId);
@@ -128,6 +134,7 @@ function Holds({ axis, k }: { axis: Axis; k: number }) {
     axis.toggle
       ? { onClick: () => setSwitch(k, value > 0) }
       : {
+          onTouchStart: noGesture,
           onPointerDown: (event: PointerEvent) => {
             event.preventDefault();
             (event.currentTarget as HTMLElement).setPointerCapture(event.pointerId);
@@ -161,6 +168,7 @@ function Assist({ controls }: { controls: Description }) {
       type="button"
       class={`button assist ${on ? "on" : ""}`}
       tabIndex={-1}
+      onTouchStart={noGesture}
       onPointerDown={(event) => {
         event.preventDefault();
         event.currentTarget.setPointerCapture(event.pointerId);

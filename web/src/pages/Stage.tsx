@@ -3,8 +3,8 @@
 import { signal, useComputed, type Signal } from "@preact/signals";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { get } from "../api";
-import { dragTo, drop, held, letGo, sending } from "../drive";
-import { clock, duration, milliseconds, plural } from "../format";
+import { dragTo, drop, giveBackKey, held, letGo, resetKey, sending } from "../drive";
+import { clock, duration, keyLabel, milliseconds, plural } from "../format";
 import { fitted, normalised } from "../inputs";
 import { giveBack, hardReset, handOver, takeOver } from "../live";
 import { LOOK_TEXT, Mode as ModeNumber, reasonText } from "../modes";
@@ -17,7 +17,7 @@ import type { OperatorRow } from "../protocol";
 import { emergencyStop } from "../stop";
 import * as store from "../store";
 import { noStats, type ViewStats } from "../video";
-import { Controls } from "./Controls";
+import { Controls, noGesture } from "./Controls";
 import { Tile, withWhom } from "./Wall";
 
 export function Stage({ index }: { index: number }) {
@@ -97,6 +97,7 @@ export function View({ frame, index, camera, stats, mine }: { frame: { current: 
   const start = useRef<[number, number] | null>(null);
   const listeners = usable
     ? {
+        onTouchStart: noGesture,
         onPointerDown: (event: PointerEvent) => {
           if (event.button !== 0) return;
           event.preventDefault();
@@ -249,11 +250,11 @@ function Actions({ index, mine }: { index: number; mine: boolean }) {
         </p>
         {fallen ? <p class="quiet">It violated its constraint and stands still. It can be driven when it has been reset.</p> : null}
         <div class="action-grid">
-          <button type="button" class={`button ${fallen ? "" : "primary"}`} disabled={resetting} onClick={() => void giveBack(index)} aria-keyshortcuts="g">
-            Give back <kbd>G</kbd>
+          <button type="button" class={`button ${fallen ? "" : "primary"}`} disabled={resetting} onClick={() => void giveBack(index)} aria-keyshortcuts={keyLabel(giveBackKey())}>
+            Give back <kbd>{keyLabel(giveBackKey())}</kbd>
           </button>
-          <button type="button" class={`button ${fallen ? "primary" : ""}`} disabled={resetting} onClick={() => askReset(index)} aria-keyshortcuts="h">
-            Hard reset… <kbd>H</kbd>
+          <button type="button" class={`button ${fallen ? "primary" : ""}`} disabled={resetting} onClick={() => askReset(index)} aria-keyshortcuts={keyLabel(resetKey())}>
+            Hard reset… <kbd>{keyLabel(resetKey())}</kbd>
           </button>
           <HandOver index={index} />
           {stop}

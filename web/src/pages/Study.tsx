@@ -5,6 +5,8 @@ import type { ComponentChildren } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { errorText, post } from "../api";
 import { soundReady, unlock } from "../chime";
+import { giveBackKey, resetKey } from "../drive";
+import { keyLabel } from "../format";
 import { giveBack, takeOver } from "../live";
 import { Mode as ModeNumber } from "../modes";
 import { Mode } from "../parts/Glyph";
@@ -266,11 +268,11 @@ function Driving({ index, back }: { index: number; back: boolean }) {
           <div class="action-grid">
             {back ? (
               <button type="button" class="button primary" disabled={resetting} onClick={() => void giveBack(index)}>
-                Give back <kbd>G</kbd>
+                Give back <kbd>{keyLabel(giveBackKey())}</kbd>
               </button>
             ) : null}
             <button type="button" class={`button ${fallen ? "primary" : ""}`} disabled={resetting} onClick={() => askReset(index)}>
-              Hard reset… <kbd>H</kbd>
+              Hard reset… <kbd>{keyLabel(resetKey())}</kbd>
             </button>
           </div>
         </div>

@@ -1,7 +1,8 @@
 /** All robots with live pictures. Only those on the screen are watched. */
 
 import { signal, type Signal } from "@preact/signals";
-import { useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
+import { columnsFor } from "../fit";
 import { LOOK_TEXT, reasonShort, reasonText } from "../modes";
 import { Mode } from "../parts/Glyph";
 import { Picture } from "../parts/Picture";
@@ -10,14 +11,14 @@ import { fleet, me, now, robots, type Robot } from "../store";
 import { clockSync } from "../store";
 import { noStats, type ViewStats } from "../video";
 
-type Size = "s" | "m" | "l";
-const FPS: Record<Size, number> = { s: 4, m: 8, l: 12 };
+type Size = "fit" | "s" | "m" | "l";
+const FPS: Record<Size, number> = { fit: 10, s: 4, m: 8, l: 12 };
 const KEY = "tutelage.wall";
 
 function stored(): Size | null {
   try {
     const value = localStorage.getItem(KEY);
-    return value === "s" || value === "m" || value === "l" ? value : null;
+    return value === "fit" || value === "s" || value === "m" || value === "l" ? value : null;
   } catch {
     return null;
   }
@@ -48,7 +49,25 @@ function order(cells: Signal<Robot>[]): Signal<Robot>[] {
 
 export function Wall() {
   const count = robots.value.length;
-  const size = chosen.value ?? (count > 40 ? "s" : count > 9 ? "m" : "l");
+  const size = chosen.value ?? "fit";
+  const list = useRef<HTMLUListElement>(null);
+  const [space, setSpace] = useState<[number, number] | null>(null);
+  useEffect(() => {
+    const measure = (): void => {
+      const element = list.current;
+      if (element) setSpace([element.clientWidth, window.innerHeight - element.getBoundingClientRect().top - window.scrollY - 20]);
+    };
+    const sized = new ResizeObserver(measure);
+    if (list.current) sized.observe(list.current);
+    window.addEventListener("resize", measure);
+    return () => {
+      sized.disconnect();
+      window.removeEventListener("resize", measure);
+    };
+  }, []);
+  const narrow = space !== null && space[0] < 700;
+  const columns = space && size === "fit" ? (narrow ? 2 : columnsFor(count, ...space)) : null;
+  const look = size === "fit" ? (narrow || (space && columns && space[0] / columns < 230) ? "m" : "l") : size;
   const cameras = fleet.value?.cameras ?? [];
   return (
     <section class="wall-section" aria-label="Robots">
@@ -73,15 +92,15 @@ export function Wall() {
           Who needs help first
         </label>
         <fieldset class="segments small" aria-label="Size of pictures">
-          {(["s", "m", "l"] as const).map((value) => (
+          {(["fit", "s", "m", "l"] as const).map((value) => (
             <label key={value}>
               <input type="radio" name="size" checked={size === value} onChange={() => choose(value)} />
-              <span>{value.toUpperCase()}</span>
+              <span>{value === "fit" ? "Fit" : value.toUpperCase()}</span>
             </label>
           ))}
         </fieldset>
       </div>
-      <ul class={`wall wall-${size}`}>
+      <ul ref={list} class={`wall wall-${look}`} style={columns ? { gridTemplateColumns: `repeat(${columns}, minmax(0, 1fr))` } : undefined}>
         {order(robots.value).map((cell) => (
           <Tile key={cell.peek().index} cell={cell} fps={FPS[size]} camera={Math.min(camera.value, Math.max(0, cameras.length - 1))} />
         ))}

@@ -16,6 +16,8 @@ export function askToClear(robot: number | null, name: string): void {
   });
 }
 
+let pressed = -Infinity;
+
 export function EStop() {
   if (!canOperate.value) return null;
   const stopped = snapshot.value?.stopped.filter(Boolean).length ?? 0;
@@ -29,7 +31,15 @@ export function EStop() {
       <button
         type="button"
         class="estop"
-        onClick={() => void emergencyStop(null)}
+        // At once when it is pressed, not when it is let go; the click of a key has no press before it.
+        onPointerDown={(event) => {
+          if (event.button !== 0) return;
+          pressed = event.timeStamp;
+          void emergencyStop(null);
+        }}
+        onClick={(event) => {
+          if (event.timeStamp - pressed > 2000) void emergencyStop(null);
+        }}
         title="Stops every robot at once (Esc twice)"
         aria-label="Emergency stop: all robots"
         aria-keyshortcuts="Escape Escape"

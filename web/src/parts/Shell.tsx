@@ -4,7 +4,8 @@ import type { ComponentChildren } from "preact";
 import { useState } from "preact/hooks";
 import { errorText, post } from "../api";
 import { setSound, soundOn, soundReady, unlock } from "../chime";
-import { milliseconds } from "../format";
+import { giveBackKey, resetKey } from "../drive";
+import { keyLabel, milliseconds } from "../format";
 import { disconnect, retryNow, setAvailable } from "../live";
 import { route } from "../route";
 import * as store from "../store";
@@ -242,9 +243,9 @@ export function Shortcuts() {
       <dd>accept the first offer</dd>
       <dt><kbd>D</kbd></dt>
       <dd>decline it</dd>
-      <dt><kbd>G</kbd></dt>
+      <dt><kbd>{keyLabel(giveBackKey())}</kbd></dt>
       <dd>give back</dd>
-      <dt><kbd>H</kbd></dt>
+      <dt><kbd>{keyLabel(resetKey())}</kbd></dt>
       <dd>hard reset</dd>
     </dl>
   );
