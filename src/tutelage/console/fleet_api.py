@@ -16,7 +16,7 @@ from tutelage.console.chain import Row
 from tutelage.console.context import at_least, context_of, has_webrtc, local, session_of
 from tutelage.console.messages import Robot
 from tutelage.console.pictures import jpeg
-from tutelage.console.plain import parsed, plain, text
+from tutelage.console.plain import parsed, plain, text_in_pieces
 from tutelage.console.verifying import verify_apart
 
 router = APIRouter()
@@ -33,9 +33,9 @@ class Which(BaseModel):
     robot: Robot | None
 
 
-async def _answer(request: Request, call: Callable[[], Any]) -> Response:
+async def _answer(request: Request, call: Callable[[], dict[str, Any]]) -> Response:
     """What `call` returns as JSON. All of it is done in a thread: thousands of rows would hold up the sockets."""
-    content = await context_of(request).slow.run(lambda: text(plain(call())))
+    content = await context_of(request).slow.run(lambda: text_in_pieces(call()))
     return Response(content, media_type="application/json")
 
 

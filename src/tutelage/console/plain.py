@@ -30,6 +30,20 @@ def text(value: Any) -> str:
         return json.dumps(plain(value), allow_nan=False, separators=(",", ":"), default=str)
 
 
+def text_in_pieces(value: dict[str, Any]) -> str:
+    """The same for an object with long lists: one piece after the other, as encoding a long list in one go holds up all
+    other threads for as long as it takes."""
+    pieces = []
+    for name, content in value.items():
+        items = (
+            "[" + ",".join([text(plain(item)) for item in content]) + "]"
+            if isinstance(content, list)
+            else text(plain(content))
+        )
+        pieces.append(f"{json.dumps(name)}:{items}")
+    return "{" + ",".join(pieces) + "}"
+
+
 def parsed(value: str) -> Any:
     """JSON from the record; damaged text is shown as it is."""
     try:
