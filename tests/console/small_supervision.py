@@ -193,9 +193,9 @@ class SmallSupervision(Supervision):
     def episodes(self, limit: int = 100) -> list[dict[str, Any]]:
         return [{"id": 1, "robot": 0, "operator": "ana", "began": 0.0, "seconds": 1.0, "outcome": "given_back", "frames": 2}]
 
-    def episode(self, id: int) -> dict[str, Any]:
+    def episode(self, id: int) -> dict[str, Any] | None:
         if id != 1:
-            raise Denied("unknown_episode", f"no episode {id}")
+            return None
         return self.episodes()[0] | {"frames": [{"t": 0, "wanted": np.array([np.nan, 1.0])}]}
 
     def episode_frame(self, id: int, frame: int, width: int = 640, height: int = 360) -> Frame | None:

@@ -52,7 +52,7 @@ def test_what_the_fleet_tells_is_json_without_nan(running: Running) -> None:
         assert rows[0]["rohe"] is None
         assert client.get("/api/episodes").json()["rows"][0]["outcome"] == "given_back"
         assert client.get("/api/episodes/1").json()["frames"] == [{"t": 0, "wanted": [None, 1.0]}]
-        assert client.get("/api/episodes/9").status_code == 409
+        assert client.get("/api/episodes/9").status_code == 404
         picture = client.get("/api/episodes/1/frames/0.jpg")
         assert picture.headers["content-type"] == "image/jpeg"
         assert picture.content.startswith(b"\xff\xd8")

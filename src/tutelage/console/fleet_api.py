@@ -33,9 +33,20 @@ class Which(BaseModel):
     robot: Robot | None
 
 
-async def _answer(request: Request, call: Callable[[], dict[str, Any]]) -> Response:
-    """What `call` returns as JSON. All of it is done in a thread: thousands of rows would hold up the sockets."""
-    content = await context_of(request).slow.run(lambda: text_in_pieces(call()))
+async def _answer(request: Request, call: Callable[[], dict[str, Any] | None]) -> Response:
+    """What `call` returns as JSON. All of it is done in a thread: thousands of rows would hold up the sockets.
+
+    Raises:
+        HTTPException: 404: it returned None.
+    """
+
+    def make() -> str | None:
+        found = call()
+        return None if found is None else text_in_pieces(found)
+
+    content = await context_of(request).slow.run(make)
+    if content is None:
+        raise HTTPException(404, "there is nothing here")
     return Response(content, media_type="application/json")
 
 

@@ -35,12 +35,11 @@ def text_in_pieces(value: dict[str, Any]) -> str:
     other threads for as long as it takes."""
     pieces = []
     for name, content in value.items():
-        items = (
-            "[" + ",".join([text(plain(item)) for item in content]) + "]"
-            if isinstance(content, list)
-            else text(plain(content))
-        )
-        pieces.append(f"{json.dumps(name)}:{items}")
+        if isinstance(content, list):
+            said = "[" + ",".join([text(plain(item)) for item in content]) + "]"
+        else:
+            said = text(plain(content))
+        pieces.append(f"{json.dumps(name)}:{said}")
     return "{" + ",".join(pieces) + "}"
 
 
