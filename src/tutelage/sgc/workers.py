@@ -78,3 +78,6 @@ class Workers:
                 job[0](*job[1])
             except Exception:
                 log.exception("%s", self._name)
+            # What the call was given must not live until the next one: a query that a thread lets go of while the program
+            # ends aborts it ("FATAL: exception not rethrown"), as Zenoh asks for an interpreter that is no longer there.
+            del job

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -25,12 +24,6 @@ if TYPE_CHECKING:
     from tutelage.sgc.transport.tunnel import TunnelClient
 
 log = logging.getLogger(__name__)
-
-DRAIN = 0.1
-"""Seconds for which `close` lets Zenoh's threads finish the callbacks that they are about to make: they need the
-interpreter, and one that finds it ending aborts the program ("FATAL: exception not rethrown"). It makes that rarer; on a
-machine that is very busy it can be too short.
-"""
 
 OVERLAP = 0.5
 """Seconds for which `renew` keeps the old connection beside the new one, until the routers know the new one."""
@@ -177,13 +170,10 @@ class ZenohTransport(Transport):
         self._closed.set()
         with self._lock:
             session, self._session = self._session, None
-            declarations, self._declarations = self._declarations, set()
-            self._publishers = {}
-        for declaration in declarations:
-            declaration.end()
+            self._declarations.clear()
+            self._publishers.clear()
         if session is not None:
             session.close()
-            time.sleep(DRAIN)
         for tunnel in self._tunnels.values():
             tunnel.close()
         self._pool.close()
