@@ -17,7 +17,8 @@ from consoles import PASSWORD, Running
 
 from tutelage.console.audit import Audit
 from tutelage.console.scripted import ScriptedOperator, after
-from tutelage.console.study import LABELS, OutOfOrderError, Study, StudyConfig
+from tutelage.console.study import Study
+from tutelage.console.study_parts import LABELS, OutOfOrderError, StudyConfig
 from tutelage.console.study_table import study_table
 from tutelage.errors import ConfigError
 from tutelage.experiments.jobs import slug

@@ -14,58 +14,38 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
-from tutelage.console.chain import START, Head, HeadFile, Row, Verdict, digest, verify
+from tutelage.console.chain import START, Head, HeadFile, Row, Verdict, digest
+from tutelage.console.records import COLUMNS, NOT_BULK, SAMPLE, connect, head_of
+from tutelage.console.records import RecordError as RecordError
+from tutelage.console.records import Sample as Sample
+from tutelage.console.records import samples_in as samples_in
+from tutelage.console.records import verify_folder as verify_folder
 from tutelage.errors import TutelageError
 
 Array = NDArray[Any]
 _Waiting = tuple[float, str, str, int | None, str, bytes | None]
 
 VERSION = 1
-SAMPLE = "sample"
-"""Kind of the rows that hold the arrays of one timestep of an intervention."""
-BULK = (SAMPLE, "command")
-"""Kinds so frequent that a list of the record leaves them out unless asked."""
-_NOT_BULK = f"kind NOT IN ({', '.join(repr(kind) for kind in BULK)})"  # literally so, or no partial index is used
 _PENDING_MAX = 200_000
 _HEAD_EVERY = 1.0
 _RETRY_EVERY = 0.5
-_COLUMNS = "id, time, kind, who, robot, fields, arrays, previous, hash"
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS record (
     id INTEGER PRIMARY KEY, time REAL NOT NULL, kind TEXT NOT NULL, who TEXT NOT NULL, robot INTEGER,
     fields TEXT NOT NULL, arrays BLOB, previous BLOB NOT NULL, hash BLOB NOT NULL);
 CREATE INDEX IF NOT EXISTS record_kind ON record (kind, id);
 """ + "".join(
-    f"CREATE INDEX IF NOT EXISTS record_{name} ON record ({columns}) WHERE {_NOT_BULK};"
+    f"CREATE INDEX IF NOT EXISTS record_{name} ON record ({columns}) WHERE {NOT_BULK};"
     for name, columns in {"rare": "id", "who": "who, id", "robot": "robot, id"}.items()
 )
 """The bulky kinds are in one index only: they are written most, and listed least."""
-
-
-class RecordError(TutelageError):
-    """The record cannot be written (disk full, folder gone): nothing more is to be done that must be recorded."""
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One timestep of an intervention, as `Audit.sample` was given it."""
-
-    id: int
-    time: float
-    who: str
-    robot: int
-    fields: dict[str, Any]
-    arrays: dict[str, Array]
 
 
 class Audit:
@@ -169,15 +149,15 @@ class Audit:
                 where.append(f"{column} = ?")
                 values.append(value)  # type: ignore[arg-type]
         if kind is None:
-            where.append(_NOT_BULK)
-        columns = _COLUMNS.replace("arrays", "NULL")
+            where.append(NOT_BULK)
+        columns = COLUMNS.replace("arrays", "NULL")
         query = f"SELECT {columns} FROM record WHERE {' AND '.join(where)} ORDER BY id DESC LIMIT ?"
         with closing(self._connect()) as database:
             return [Row(*row) for row in database.execute(query, [*values, limit])]
 
     def all_rows(self, after: int = 0, kind: str | None = None, arrays: bool = True) -> Iterator[Row]:
         """Every row with an id above `after`, oldest first."""
-        columns = _COLUMNS if arrays else _COLUMNS.replace("arrays", "NULL")
+        columns = COLUMNS if arrays else COLUMNS.replace("arrays", "NULL")
         where, values = ("", []) if kind is None else (" AND kind = ?", [kind])
         with closing(self._connect()) as database:
             for row in database.execute(f"SELECT {columns} FROM record WHERE id > ?{where} ORDER BY id", [after, *values]):
@@ -194,7 +174,7 @@ class Audit:
     def head(self) -> Head:
         """The newest durable row: its id and hash."""
         with closing(self._connect()) as database:
-            return _head(database)
+            return head_of(database)
 
     def verify(self, noted: bytes | None = None) -> Verdict:
         """Read the whole record and find the first row that was altered, removed or cut off; see `console.chain`.
@@ -253,7 +233,7 @@ class Audit:
         """A record that was cut off or rewritten is not continued, as that would hide it."""
         known = self._head_file.read()
         with closing(self._connect()) as database:
-            newest = _head(database)
+            newest = head_of(database)
             if known and known.rows:
                 row = database.execute("SELECT hash FROM record WHERE id = ?", [known.rows]).fetchone()
                 if row is None or row[0] != known.hash:
@@ -272,67 +252,14 @@ class Audit:
             database.executescript(f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
 
     def _connect(self) -> sqlite3.Connection:
-        return _connect(self.path)
-
-
-def verify_folder(folder: Path, noted: bytes | None = None) -> Verdict:
-    """`Audit.verify` of a record that no process needs to have open.
-
-    Raises:
-        RecordError: there is no record, or it is no database.
-    """
-    path = folder / "record.sqlite"
-    if not path.exists():
-        raise RecordError(f"there is no record in {folder}: no such file: {path}")
-    try:
-        head = HeadFile(folder).read()
-    except TutelageError as error:
-        return Verdict(False, 0, None, str(error), "")
-    try:
-        with closing(_connect(path)) as database:
-            rows = database.execute(f"SELECT {_COLUMNS} FROM record ORDER BY id")
-            return verify((Row(*row) for row in rows), head, noted)
-    except sqlite3.Error as error:
-        raise RecordError(f"{path} cannot be read: {error}") from None
-
-
-def samples_in(folder: Path, after: int = 0) -> Iterator[Sample]:
-    """`Audit.samples` of a record that another process may be writing.
-
-    Raises:
-        RecordError: there is no record, or a row's arrays are damaged.
-    """
-    path = folder / "record.sqlite"
-    try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10.0)) as database:
-            query = f"SELECT {_COLUMNS} FROM record WHERE id > ? AND kind = ? ORDER BY id"
-            for row in (Row(*values) for values in database.execute(query, [after, SAMPLE])):
-                arrays = load_arrays(row.arrays or b"")
-                robot = -1 if row.robot is None else row.robot
-                yield Sample(row.id, row.time, row.who, robot, json.loads(row.fields), arrays)
-    except sqlite3.Error as error:
-        raise RecordError(f"{path} cannot be read: {error}") from None
-    except (SafetensorError, ValueError, KeyError) as error:
-        raise RecordError(f"row {row.id} of {path} is damaged: {error}") from None
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    database = sqlite3.connect(path, timeout=10.0, isolation_level=None, check_same_thread=False)
-    database.execute("PRAGMA journal_mode = WAL")
-    database.execute("PRAGMA synchronous = FULL")
-    return database
-
-
-def _head(database: sqlite3.Connection) -> Head:
-    row = database.execute("SELECT id, hash FROM record ORDER BY id DESC LIMIT 1").fetchone()
-    return Head(*row) if row else Head(0, START)
+        return connect(self.path)
 
 
 def _commit(database: sqlite3.Connection, batch: list[_Waiting], known: Head) -> Head:
     """One transaction. The head is read anew each time, as another process may have written."""
     database.execute("BEGIN IMMEDIATE")
     try:
-        head = _head(database)
+        head = head_of(database)
         if head.rows < known.rows:
             raise RecordError(f"rows after {head.rows} were cut off")
         id, last = head.rows, head.hash

@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tutelage.console.accounts import Role, Session
 from tutelage.console.context import at_least, context_of, log
-from tutelage.console.study import OutOfOrderError, Study
+from tutelage.console.study import Study
+from tutelage.console.study_parts import OutOfOrderError
 
 router = APIRouter(prefix="/api/study")
 Operator = Annotated[Session, Depends(at_least(Role.OPERATOR))]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tutelage.console.study import read_result
+from tutelage.console.study_parts import read_result
 from tutelage.errors import ConfigError
 from tutelage.experiments import table_3_2
 from tutelage.experiments.user_study.protocol import CONDITIONS, QUESTIONS, SCALE

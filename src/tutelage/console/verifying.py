@@ -9,8 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tutelage.console.audit import RecordError, verify_folder
 from tutelage.console.chain import Verdict
+from tutelage.console.records import RecordError, verify_folder
 from tutelage.errors import TutelageError
 
 LONGEST = 600.0

@@ -44,7 +44,8 @@ def run(
 
     web = WebConfig(host, port, certificate, key, origin)
     web.check()
-    from tutelage.console.study import Study, StudyConfig
+    from tutelage.console.study import Study
+    from tutelage.console.study_parts import StudyConfig
 
     config = StudyConfig(participant, out, hz, steps, practice)
 
