@@ -122,7 +122,20 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
 
 
 def reproduce(
-    what: Positional[Literal["figure-2.3", "figure-A.1", "table-3.1", "table-3.3", "gates", "figure-5.3", "figure-C.1"]],
+    what: Positional[
+        Literal[
+            "figure-2.3",
+            "figure-A.1",
+            "table-3.1",
+            "table-3.3",
+            "gates",
+            "figure-5.3",
+            "figure-C.1",
+            "figure-C.2",
+            "figure-C.3",
+            "figure-C.4",
+        ]
+    ],
     tasks: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
     full: bool = False,
@@ -136,10 +149,10 @@ def reproduce(
         what: figure-2.3 (LazyDAgger and its rivals), figure-A.1 (its sensitivity to its thresholds), table-3.1
             (ThriftyDAgger and its rivals on peg insertion), table-3.3 (on cable routing from images), gates (all of them
             with 100 robots and 10 humans), figure-5.3 (Fleet-DAgger's comparison, with table C.2), figure-C.1 (the
-            ablations of C.U.R.).
+            ablations of C.U.R.), figure-C.2, figure-C.3, figure-C.4 (C.U.R. with other M, t_T, t_R).
         tasks: which tasks; default: those of the figure.
-        seeds: root seeds; default: 0 to 4 for figure-2.3, table-3.1 and gates (table-3.3: with --full), 0 for figure-A.1,
-            else 0 to 2.
+        seeds: root seeds; default: 0 to 4 for figure-2.3, table-3.1 and gates (table-3.3: with --full), 0 for figure-A.1
+            and, without --full, figures C.2 to C.4, else 0 to 2.
         full: the published scale; default: one that takes less than an hour on 4 cores.
         workers: runs side by side, one core each.
         out: folder of the run folders.

@@ -130,6 +130,8 @@ def configurations(study: StudyConfig, human_time: float | None) -> dict[str, Ru
         ),
         "Random": with_(base, priority="Random.", label="Random", thresholds=PriorityConfig(random=threshold)),
         "U.C.": with_(base, priority="U.C.", label="U.C."),
+        # Fleet-ThriftyDAgger needs a goal (section 5.6).
+        **({"U.G.C.": with_(base, priority="U.G.C.", label="U.G.C.")} if TASKS[study.task].goal else {}),
     }
 
 
