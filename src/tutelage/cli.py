@@ -130,6 +130,7 @@ def reproduce(
             "table-3.3",
             "gates",
             "figure-5.3",
+            "figure-5.5",
             "figure-C.1",
             "figure-C.2",
             "figure-C.3",
@@ -148,8 +149,9 @@ def reproduce(
     Args:
         what: figure-2.3 (LazyDAgger and its rivals), figure-A.1 (its sensitivity to its thresholds), table-3.1
             (ThriftyDAgger and its rivals on peg insertion), table-3.3 (on cable routing from images), gates (all of them
-            with 100 robots and 10 humans), figure-5.3 (Fleet-DAgger's comparison, with table C.2), figure-C.1 (the
-            ablations of C.U.R.), figure-C.2, figure-C.3, figure-C.4 (C.U.R. with other M, t_T, t_R).
+            with 100 robots and 10 humans), figure-5.3 (Fleet-DAgger's comparison, with table C.2),
+            figure-5.5 (block pushing with 4 robots and 2 humans, programs here), figure-C.1 (the ablations of C.U.R.),
+            figure-C.2, figure-C.3, figure-C.4 (C.U.R. with other M, t_T, t_R).
         tasks: which tasks; default: those of the figure.
         seeds: root seeds; default: 0 to 4 for figure-2.3, table-3.1 and gates (table-3.3: with --full), 0 for figure-A.1
             and, without --full, figures C.2 to C.4, else 0 to 2.

@@ -185,7 +185,8 @@ def test_after_a_goal_comes_the_next_and_nothing_else_changes(hands: MujocoFleet
 
 def test_a_cube_beside_the_hand_was_dropped_and_comes_back_to_it(hands: MujocoFleet) -> None:
     places = np.tile(REST, (4, 1))
-    places[1], places[2] = REST + [0, -0.2, 0], REST + [0, 0, -DROPPED - 0.01]
+    places[1, 1] -= 0.2
+    places[2, 2] -= DROPPED + 0.01
     put_cubes(hands, places, about_vertical(np.zeros(4)))
     _, _, _, _, info = drive(hands, HOME, 1)
     assert info["violation"].tolist() == [False, True, True, False]
@@ -217,7 +218,7 @@ def test_a_fleet_goes_on_bit_for_bit_from_a_checkpoint_across_goals() -> None:
 @pytest.mark.parametrize("side", SIDES)
 def test_each_gait_turns_the_cube_its_way(side: str) -> None:
     trial = Trial(1, 8, 100, side)
-    turned, lost = trial.run(shipped()[side].numbers[None], np.random.default_rng(0), 0.0)
+    turned, lost = trial.run(shipped()[side].numbers[None, None], np.random.default_rng(0), 0.0)
     trial.physics.close()
     assert np.median(turned) > 2.5
     assert (lost < 1).mean() >= 0.75
@@ -268,7 +269,7 @@ def test_evolution_finds_the_top_of_a_hill() -> None:
 def test_candidates_are_tried_from_the_same_starts() -> None:
     gait = shipped()["left"].numbers
     trial = Trial(2, 3, 20, "left")
-    turned, lost = trial.run(np.stack([gait, gait]), np.random.default_rng(0), 0.2)
+    turned, lost = trial.run(np.stack([gait, gait])[:, None], np.random.default_rng(0), 0.2)
     trial.physics.close()
     np.testing.assert_array_equal(turned[0], turned[1])
     np.testing.assert_array_equal(lost[0], lost[1])
@@ -281,6 +282,16 @@ def test_a_search_writes_a_gait_beside_the_other_one_and_begins_from_it_again(tm
     found = search(SearchConfig("left", **small))  # type: ignore[arg-type]
     written = json.loads(out.read_text())
     assert set(written) == {"left", "right"}
-    np.testing.assert_allclose(Gait.of(written["left"]["numbers"]).numbers, found.numbers, atol=1e-4)
+    np.testing.assert_allclose(Gait.of(written["left"]["numbers"]).numbers, found[0], atol=1e-4)
     again = search(SearchConfig("left", again=True, **small))  # type: ignore[arg-type]
-    assert 0 < np.abs(again.numbers - found.numbers).max() < 1
+    assert 0 < np.abs(again - found).max() < 1
+    out.write_text(json.dumps(written | {"right": written["left"]}))
+    assert search(SearchConfig("both", **small)).shape == (2, *again[0].shape)  # type: ignore[arg-type]
+    assert json.loads(out.read_text())["right"] != written["left"]
+
+
+def test_both_gaits_take_turns_from_goal_to_goal() -> None:
+    trial = Trial(1, 6, 120, None)
+    turned, _ = trial.run(np.stack([shipped()[side].numbers for side in SIDES])[None], np.random.default_rng(0), 0.0)
+    trial.physics.close()
+    assert np.median(turned) > 2.5

@@ -12,7 +12,7 @@ import pytest
 from small import Here, walker
 
 from tutelage.errors import ConfigError
-from tutelage.experiments import figure_2_3, gates_table, jobs, reproduction, sweeps, table_3
+from tutelage.experiments import figure_2_3, gates_table, jobs, reproduction, study, sweeps, table_3
 from tutelage.experiments.config import to_json
 from tutelage.experiments.figure_2_3 import ALGORITHMS, BC, LAZY, SAFE, Figure23Config, configuration
 from tutelage.learning.critic import CriticConfig
@@ -266,3 +266,19 @@ def test_figure_5_3_is_long_enough_for_two_episodes(monkeypatch: pytest.MonkeyPa
     assert [(s.task, s.steps, s.evaluate) for s in studies] == [
         ("Walker2d", 2000, 1000), ("Anymal", 5000, 2500), ("Walker2d", 10_000, 10_000), ("Anymal", 10_000, 10_000)
     ]  # fmt: skip
+
+
+def test_figure_5_5_is_four_robots_that_push_blocks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    studies: list[Any] = []
+    monkeypatch.setattr(reproduction, "run_study", studies.append)
+    for full in (False, True):
+        reproduction.reproduce("figure-5.5", (), (), full, 1, tmp_path, tmp_path)
+    assert [(s.task, s.robots, s.humans, s.steps, s.t_teleop, s.seeds) for s in studies] == [
+        ("BlockPushing", 4, 2, 250, 3, (0, 1, 2))
+    ] * 2
+    assert [s.observation for s in studies] == ["state", "images"]
+    runs = study.configurations(studies[1], 100.0)
+    assert {"C. (BC)", "Random", "U.C."} < set(runs)
+    assert {(run.t_teleop, run.observation, run.learner.batch) for run in runs.values()} == {(3, "images", 64)}
+    with pytest.raises(ConfigError, match=r"figure-5\.5 is about BlockPushing; leave out --tasks"):
+        reproduction.reproduce("figure-5.5", ("Ant",), (), False, 1, tmp_path, tmp_path)

@@ -18,12 +18,13 @@ def reproduce(
     """Run what is missing of a figure; returns the tables, published and ours, as Markdown.
 
     Args:
-        what: "figure-2.3", "figure-A.1", "table-3.1", "table-3.3", "gates", "figure-5.3", "figure-C.1", or "figure-C.2"
-            to "figure-C.4".
+        what: "figure-2.3", "figure-A.1", "table-3.1", "table-3.3", "gates", "figure-5.3", "figure-5.5", "figure-C.1",
+            or "figure-C.2" to "figure-C.4".
         tasks: which tasks; empty: those of the figure, or Walker2d for those of appendix C.
         seeds: root seeds; empty: the figure's own number of them.
         full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000 (Anymal, whose episodes have
-            2,500, has 5,000), figure-C.1 3,000, figures C.2 to C.4 2,000 and one seed in place of three; `gates`, which
+            2,500, has 5,000), figure-5.5 sees states in place of images,
+            figure-C.1 3,000, figures C.2 to C.4 2,000 and one seed in place of three; `gates`, which
             nobody published, 2,000 in place of 10,000; table-3.3 has 3 seeds and trains its networks on instead of anew;
             table-3.1 has the published scale in any case.
         workers: runs side by side.
@@ -57,6 +58,16 @@ def reproduce(
         if not full:
             given.setdefault("seeds", tuple(range(table_3.SETTINGS[what].seeds)))
         return table_3.reproduce(table_3.Table3Config(what, full=full, **given))
+    if what == "figure-5.5":
+        if tasks not in ((), ("BlockPushing",)):
+            raise ConfigError("figure-5.5 is about BlockPushing; leave out --tasks")
+        run_study(
+            StudyConfig(
+                "BlockPushing", seeds or (0, 1, 2), steps=250, robots=4, humans=2, t_teleop=3, evaluate=0,
+                observation="images" if full else "state", workers=workers, out=out, results=results / "fleet",
+            )
+        )  # fmt: skip
+        return tables(results / "fleet")
     ablations = what == "figure-C.1"
     for task in tasks or (("Walker2d",) if ablations else ("Walker2d", "Ant", "Humanoid", "Anymal")):
         horizon = TASKS[task].horizon if task in TASKS else 1  # what is unknown, the study refuses

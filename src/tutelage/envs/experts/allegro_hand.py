@@ -68,6 +68,19 @@ def features(place: Array, turn: Array) -> Array:
     return np.column_stack([20 * (place - REST)[:, :2], lean, np.cos(4 * yaw), np.sin(4 * yaw)])
 
 
+def follow(period: Array, feedback: Array, heeded: Array, previous: Array) -> Array:
+    """The actions (N, 16) of each gait that come after the previous actions.
+
+    Args:
+        period, feedback: (N, `CYCLE`, 16) and (N, `FEATURES`, 16) of the gaits.
+        heeded: (N, `FEATURES`) what `features` says about the cubes.
+        previous: (N, 16).
+    """
+    choices = (period + np.einsum("nf,nfj->nj", heeded, feedback)[:, None]).clip(-1, 1)
+    now = np.square(choices - previous[:, None]).sum(axis=2).argmin(axis=1)
+    return choices[np.arange(len(choices)), (now + 1) % CYCLE]  # type: ignore[no-any-return]
+
+
 def shipped() -> dict[str, Gait]:
     """The gaits that were found, by `SIDES`."""
     found: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
@@ -92,7 +105,5 @@ class Turner:
         scalar, vertical = state[:, 68], state[:, 71]  # of the turn from the goal to the cube
         beyond = (2 * np.arctan2(vertical, scalar) + np.pi) % (2 * np.pi) - np.pi
         side = (beyond > 0).astype(np.intp)
-        heed = np.einsum("nf,nfj->nj", features(state[:, 48:51], state[:, 51:55]), self._feedback[side])
-        choices = (self._period[side] + heed[:, None]).clip(-1, 1)
-        now = np.square(choices - state[:, None, 72:88]).sum(axis=2).argmin(axis=1)
-        return choices[np.arange(len(state)), (now + 1) % CYCLE].astype(np.float32)  # type: ignore[no-any-return]
+        heeded = features(state[:, 48:51], state[:, 51:55])
+        return follow(self._period[side], self._feedback[side], heeded, state[:, 72:88]).astype(np.float32)  # type: ignore[no-any-return]

@@ -2,10 +2,12 @@
 
     python -m tutelage.envs.experts.gait_search left
     python -m tutelage.envs.experts.gait_search right
+    python -m tutelage.envs.experts.gait_search both --steps 200
 
-Candidates turn the cube for 5 s from the same starts; what counts is how far. First in calm, then with noise on the actions,
-where a gait also learns to heed the cube. The search is a covariance matrix adaptation with a diagonal matrix (Ros and Hansen,
-2008). It takes about ten minutes of one core for each side.
+Candidates turn the cube for some seconds from the same starts; what counts is how far. First in calm, then with noise on the
+actions, where a gait also learns to heed the cube; at last both together,
+from goal to goal. The search is a covariance matrix adaptation with a diagonal matrix (Ros and Hansen,
+2008). It takes about ten minutes of one core each.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ import tyro
 from tyro.conf import Positional
 
 from tutelage.envs.engine import Physics, wait
-from tutelage.envs.experts.allegro_hand import BASIS, CYCLE, FEATURES, FILE, HARMONICS, SIDES, Gait, features
-from tutelage.envs.tasks.allegro_hand import DROPPED, HOME, RANGE, REST, AllegroHand
+from tutelage.envs.experts.allegro_hand import BASIS, CYCLE, FEATURES, FILE, HARMONICS, SIDES, Gait, features, follow
+from tutelage.envs.tasks.allegro_hand import APART, DROPPED, HOME, RANGE, REST, TOLERANCE, AllegroHand
 from tutelage.envs.tasks.base import Array
 from tutelage.seeding import stream
 from tutelage.store import write_atomic
@@ -38,7 +40,8 @@ class SearchConfig:
     """What to search, and for how long.
 
     Attributes:
-        side: the way in which the gait is to turn the cube, as seen from above.
+        side: the way in which the gait is to turn the cube, as seen from above; "both": let the two gaits that are there
+            take turns from goal to goal, and improve them together.
         calm: generations in calm.
         noisy: generations with noise on the actions, heeding the cube.
         noise: standard deviation of that noise, in halves of the action range.
@@ -51,10 +54,10 @@ class SearchConfig:
         out: file to which the gait is added.
     """
 
-    side: Positional[Literal["left", "right"]]
+    side: Positional[Literal["left", "right", "both"]]
     calm: int = 160
     noisy: int = 140
-    noise: float = 0.2
+    noise: float = 0.1
     candidates: int = 40
     starts: int = 3
     steps: int = 100
@@ -65,51 +68,71 @@ class SearchConfig:
 
 
 class Trial:
-    """Hands that try gaits, as many at once as there are candidates and starts."""
+    """Hands that try gaits, as many at once as there are candidates and starts.
 
-    def __init__(self, candidates: int, starts: int, steps: int, side: str, threads: int = 1) -> None:
-        self.candidates, self.starts, self.steps, self.sign = candidates, starts, steps, SIDES[side]
+    Args:
+        candidates: how many gaits, or pairs of gaits, are tried.
+        starts: episodes of each.
+        steps: timesteps of an episode.
+        side: the way in which the cube is to be turned, without end; None: to goal after goal, as in the task.
+        threads: physics threads.
+    """
+
+    def __init__(self, candidates: int, starts: int, steps: int, side: str | None, threads: int = 1) -> None:
+        self.candidates, self.starts, self.steps, self.side = candidates, starts, steps, side
         self.task, self.n = AllegroHand(), candidates * starts
         self.physics = Physics(self.task.xml_path, self.n, self.task.fields, push_body="cube", threads=threads)
 
     def run(self, gaits: Array, rng: np.random.Generator, noise: float) -> tuple[Array, Array]:
-        """How far each candidate turned the cube its way, rad, and what it lost by leaving its place, leaning and dropping.
+        """How far each candidate turned the cube where it was to go, rad, and what it lost by leaving, leaning and dropping.
 
         Args:
-            gaits: (candidates, rows of a `Gait`, 16).
-            rng: starts and noise are the same for all candidates.
+            gaits: (candidates, sides, rows of a `Gait`, 16), in the order of `SIDES`; of one side only where it has one.
+            rng: starts, goals and noise are the same for all candidates.
             noise: standard deviation, in halves of the action range.
 
         Returns:
             Turns and losses, (candidates, starts).
         """
-        physics, n = self.physics, self.n
+        physics, n, everyone = self.physics, self.n, np.arange(self.n)
         qpos, qvel = self.task.initial(rng, self.starts, physics.qpos0, physics.qvel0)
-        physics.restart(np.arange(n), np.tile(qpos, (self.candidates, 1)), np.tile(qvel, (self.candidates, 1)))
-        phase = np.tile(rng.integers(CYCLE, size=self.starts), self.candidates)
+        physics.restart(everyone, np.tile(qpos, (self.candidates, 1)), np.tile(qvel, (self.candidates, 1)))
         rows = np.repeat(gaits, self.starts, axis=0)
-        periods = rows[:, :1] + np.einsum("nhj,hk->nkj", rows[:, 1 : 1 + 2 * HARMONICS], BASIS)
-        feedback = rows[:, 1 + 2 * HARMONICS :]
-        turned, lost, going = np.zeros(n), np.zeros(n), np.ones(n, dtype=bool)
-        frame = physics.frame
+        periods = rows[:, :, :1] + np.einsum("nshj,hk->nskj", rows[:, :, 1 : 1 + 2 * HARMONICS], BASIS)
+        feedback = rows[:, :, 1 + 2 * HARMONICS :]
+        courses = np.tile(self._courses(rng), (self.candidates, 1))
+        goal, left, at = np.zeros(n, dtype=np.intp), courses[:, 0].copy(), np.zeros(n, dtype=np.intp)
+        previous = periods[everyone, at, np.tile(rng.integers(CYCLE, size=self.starts), self.candidates)]
+        turned, lost, going, frame = np.zeros(n), np.zeros(n), np.ones(n, dtype=bool), physics.frame
         yaw, _ = _yaw_and_lean(frame["qpos"])
         for t in range(self.steps):
-            heed = np.einsum("nf,nfj->nj", features(frame["qpos"][:, CUBE], frame["qpos"][:, TURN]), feedback)
-            actions = (periods[np.arange(n), phase] + heed).clip(-1, 1)
-            shaken = actions + noise * np.tile(rng.standard_normal((self.starts, 16)), (self.candidates, 1))
-            command = self.task.control(frame, shaken.clip(-1, 1))
+            at = (left < 0).astype(np.intp) if self.side is None else at
+            heeded = features(frame["qpos"][:, CUBE], frame["qpos"][:, TURN])
+            actions = follow(periods[everyone, at], feedback[everyone, at], heeded, previous)
+            previous = (actions + noise * np.tile(rng.standard_normal((self.starts, 16)), (self.candidates, 1))).clip(-1, 1)
+            command = self.task.control(frame, previous)
             wait(physics.advance_async(np.flatnonzero(going), command, None, self.task.frame_skip))
-            phase = (phase + 1) % CYCLE
             before, (yaw, upright) = yaw, _yaw_and_lean(frame["qpos"])
             turn = (yaw - before + np.pi) % (2 * np.pi) - np.pi
             away = np.linalg.norm(frame["qpos"][:, CUBE] - REST, axis=1)
-            turned += np.where(going & (upright > FLAT), self.sign * turn, 0.0)
+            turned += np.where(going & (upright > FLAT), np.sign(left) * turn, 0.0)
+            left = left - turn
+            there = going & (np.abs(left) < TOLERANCE) & (upright > np.cos(TOLERANCE))
+            goal += there
+            left = np.where(there, courses[everyone, goal], left)
             lost += np.where(going, 0.2 * away + 0.05 * (1 - upright), 0.0)
             over = going & ((away > DROPPED) | (upright < UPRIGHT) | (physics.unstable != 0))
             lost += np.where(over, LOSS + 0.03 * (self.steps - t), 0.0)
             going &= ~over
         shape = (self.candidates, self.starts)
         return turned.reshape(shape), lost.reshape(shape)
+
+    def _courses(self, rng: np.random.Generator) -> Array:
+        """How far each goal is from the one before, (starts, goals), rad; more goals than there are timesteps."""
+        shape = (self.starts, self.steps + 1)
+        if self.side:
+            return np.full(shape, SIDES[self.side] * np.inf)
+        return rng.uniform(APART, np.pi, shape) * rng.choice([-1.0, 1.0], shape)  # type: ignore[no-any-return]
 
 
 class Evolution:
@@ -161,34 +184,38 @@ class Evolution:
         self.step = min(0.4, self.step * float(np.exp(self.c_step / self.damping * (length / self.expected - 1))))
 
 
-def search(config: SearchConfig) -> Gait:
-    """Find a gait, and add it to the file."""
-    shape = (1 + 2 * HARMONICS + FEATURES, 16)
-    if config.again:
-        gait = np.reshape(json.loads(config.out.read_text(encoding="utf-8"))[config.side]["numbers"], shape)
+def search(config: SearchConfig) -> Array:
+    """Find gaits, (sides, rows of a `Gait`, 16), and add them to the file."""
+    sides = tuple(SIDES) if config.side == "both" else (config.side,)
+    if config.again or config.side == "both":
+        known = json.loads(config.out.read_text(encoding="utf-8"))
+        gaits = np.stack([Gait.of(known[side]["numbers"]).numbers for side in sides])
     else:
-        gait = _evolve(config, _first_guess(shape), config.calm, 0.0)
-    gait = _evolve(config, gait, config.noisy, config.noise)
+        gaits = _evolve(config, _first_guess()[None], config.calm, 0.0)
+    gaits = _evolve(config, gaits, config.noisy, config.noise)
     found = json.loads(config.out.read_text(encoding="utf-8")) if config.out.exists() else {}
-    found[config.side] = {"noise": config.noise, "seed": config.seed, "numbers": gait.ravel().round(4).tolist()}
+    for side, gait in zip(sides, gaits, strict=True):
+        found[side] = {"noise": config.noise, "seed": config.seed, "numbers": gait.ravel().round(4).tolist()}
     write_atomic(config.out, (json.dumps(found, sort_keys=True) + "\n").encode())
-    return Gait(gait)
+    return gaits
 
 
-def _evolve(config: SearchConfig, gait: Array, generations: int, noise: float) -> Array:
-    scale = np.ones(gait.shape)
-    scale[3 : 1 + 2 * HARMONICS] = 0.5
-    scale[1 + 2 * HARMONICS :] = 0.4 if noise else 0.0
+def _evolve(config: SearchConfig, gaits: Array, generations: int, noise: float) -> Array:
+    scale = np.ones(gaits.shape)
+    scale[:, 3 : 1 + 2 * HARMONICS] = 0.5
+    scale[:, 1 + 2 * HARMONICS :] = 0.4 if noise else 0.0
+    side = None if config.side == "both" else config.side
     rng = stream(config.seed, f"gait search/{config.side}/{noise}")
-    evolution = Evolution(gait.ravel(), scale.ravel(), 0.06 if noise else 0.15, config.candidates, rng)
-    trial = Trial(config.candidates, config.starts, config.steps, config.side, config.threads)
-    check = Trial(1, 60, config.steps, config.side, config.threads)
+    step = 0.15 if not noise else 0.06 if side else 0.03
+    evolution = Evolution(gaits.ravel(), scale.ravel(), step, config.candidates, rng)
+    trial = Trial(config.candidates, config.starts, config.steps, side, config.threads)
+    check = Trial(1, 60, config.steps, side, config.threads)
     for generation in range(generations):
-        turned, lost = trial.run(evolution.ask().reshape(config.candidates, *gait.shape), rng, noise)
+        turned, lost = trial.run(evolution.ask().reshape(config.candidates, *gaits.shape), rng, noise)
         worth = turned - lost
         evolution.tell(worth.mean(axis=1) - 0.3 * worth.std(axis=1))
         if generation % 20 == 19:
-            turned, lost = check.run(evolution.mean.reshape(1, *gait.shape), stream(config.seed, "gait check"), noise)
+            turned, lost = check.run(evolution.mean.reshape(1, *gaits.shape), stream(config.seed, "gait check"), noise)
             print(
                 f"{config.side}, noise {noise:g}, generation {generation + 1}: turns {turned.mean():.2f} rad in "
                 f"{config.steps / 20:.0f} s, fails in {(lost > LOSS).mean():.0%}",
@@ -196,12 +223,12 @@ def _evolve(config: SearchConfig, gait: Array, generations: int, noise: float) -
             )
     trial.physics.close()
     check.physics.close()
-    return evolution.mean.reshape(gait.shape)  # type: ignore[no-any-return]
+    return evolution.mean.reshape(gaits.shape)  # type: ignore[no-any-return]
 
 
-def _first_guess(shape: tuple[int, int]) -> Array:
+def _first_guess() -> Array:
     """Fingers stand around the cube and swing to and fro."""
-    gait = np.zeros(shape)
+    gait = np.zeros((1 + 2 * HARMONICS + FEATURES, 16))
     gait[0] = 2 * (HOME - RANGE[0]) / (RANGE[1] - RANGE[0]) - 1
     gait[1, [0, 4, 8]], gait[2, [1, 5, 9, 13]] = 0.4, 0.15
     return gait
