@@ -13,7 +13,7 @@ import pytest
 
 from tutelage.checks import check_policy
 from tutelage.envs import experts
-from tutelage.envs.experts.allegro_hand import CYCLE, SIDES, Gait, Turner, features, shipped
+from tutelage.envs.experts.allegro_hand import CYCLE, RATE, SIDES, Gait, Turner, features, shipped
 from tutelage.envs.experts.gait_search import Evolution, SearchConfig, Trial, search
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.tasks import TASKS, allegro_hand
@@ -220,22 +220,26 @@ def test_each_gait_turns_the_cube_its_way(side: str) -> None:
     trial = Trial(1, 8, 100, side)
     turned, lost = trial.run(shipped()[side].numbers[None, None], np.random.default_rng(0), 0.0)
     trial.physics.close()
-    assert np.median(turned) > 2.5
+    assert np.median(turned) > 1.8
     assert (lost < 1).mean() >= 0.75
 
 
 def test_the_human_goes_the_shorter_way_round_and_on_from_the_previous_action(hands: MujocoFleet) -> None:
     obs, human = hands.task.observe(hands.physics.frame).copy(), Turner()
     obs[:, 68:72] = about_vertical(np.array([1.0, -1.0, 3.0, -3.0])) * SCALE[68:72]
-    for k in range(CYCLE):
+    reaches = np.full(4, np.inf)
+    for k in range(2 * CYCLE):
         action = np.asarray(human.act(obs), dtype=np.float64)
         if k:
+            assert np.abs(action - obs[:, 72:88]).max() < RATE + 1e-5
             heed = features(obs[:, 48:51] / SCALE[48:51], obs[:, 51:55])
             for row, side in zip(range(4), ("right", "left", "right", "left"), strict=True):
                 gait = shipped()[side]
                 choices = (gait.period + heed[row] @ gait.feedback).clip(-1, 1)
-                assert np.abs(choices - action[row]).max(axis=1).min() < 1e-5
+                gap = np.abs(choices - action[row]).max(axis=1).min()
+                reaches[row] = min(reaches[row], gap)
         obs[:, 72:88] = action
+    assert (reaches < 0.05).all(), "each hand is in its gait after a while"
     assert np.abs(np.asarray(human.act(obs)) - action).max() > 0.05, "it does not stand still"
 
 

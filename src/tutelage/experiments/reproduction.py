@@ -49,6 +49,7 @@ def reproduce(
     if what in sweeps.SWEEPS:
         if full:
             given.setdefault("seeds", (0, 1, 2))
+        given["out"] = out.parent / "figures-C.2-to-C.4"  # which have runs in common
         steps = 10_000 if full else sweeps.SweepConfig.steps
         return sweeps.reproduce(sweeps.SweepConfig(what, steps=steps, **given))
     if what in table_3.SETTINGS:

@@ -21,6 +21,8 @@ SIDES = {"left": 1.0, "right": -1.0}
 CYCLE = 16
 """Timesteps of a period."""
 HARMONICS = 2
+RATE = 0.25
+"""Largest change of an action in a timestep. From one gait to the other fingers go gently, or they throw the cube out."""
 FEATURES = 6
 """How many numbers about the cube a gait heeds."""
 _ROWS = 1 + 2 * HARMONICS + FEATURES
@@ -69,7 +71,7 @@ def features(place: Array, turn: Array) -> Array:
 
 
 def follow(period: Array, feedback: Array, heeded: Array, previous: Array) -> Array:
-    """The actions (N, 16) of each gait that come after the previous actions.
+    """The actions (N, 16) of each gait that come after the previous actions, or as far towards them as `RATE` allows.
 
     Args:
         period, feedback: (N, `CYCLE`, 16) and (N, `FEATURES`, 16) of the gaits.
@@ -78,7 +80,8 @@ def follow(period: Array, feedback: Array, heeded: Array, previous: Array) -> Ar
     """
     choices = (period + np.einsum("nf,nfj->nj", heeded, feedback)[:, None]).clip(-1, 1)
     now = np.square(choices - previous[:, None]).sum(axis=2).argmin(axis=1)
-    return choices[np.arange(len(choices)), (now + 1) % CYCLE]  # type: ignore[no-any-return]
+    change = choices[np.arange(len(choices)), (now + 1) % CYCLE] - previous
+    return previous + change.clip(-RATE, RATE)  # type: ignore[no-any-return]
 
 
 def shipped() -> dict[str, Gait]:

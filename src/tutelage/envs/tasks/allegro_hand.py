@@ -54,6 +54,8 @@ class AllegroHand(GoalTask):
     push_body, camera = "cube", "fixed"
     horizon = 600
     goes_on = True
+    disturbance = "mild"
+    offline_pairs = 1000
     action_low, action_high = (-np.ones(16, dtype=np.float32), np.ones(16, dtype=np.float32))
     expert = "tutelage.envs.experts.allegro_hand:Turner"
     summary = "a hand of four fingers turns a cube about the vertical to goals; violation: the cube was dropped"
