@@ -58,7 +58,7 @@ class AllegroHand(GoalTask):
     offline_pairs = 1000
     action_low, action_high = (-np.ones(16, dtype=np.float32), np.ones(16, dtype=np.float32))
     expert = "tutelage.envs.experts.allegro_hand:Turner"
-    summary = "a hand of four fingers turns a cube about the vertical to goals; violation: the cube was dropped"
+    summary = "a hand of four fingers turns a cube about the vertical to goals; violation: cube dropped"
 
     def control(self, frame: Frame, actions: Array) -> Array:
         low, high = RANGE
