@@ -109,4 +109,4 @@ class Turner:
         beyond = (2 * np.arctan2(vertical, scalar) + np.pi) % (2 * np.pi) - np.pi
         side = (beyond > 0).astype(np.intp)
         heeded = features(state[:, 48:51], state[:, 51:55])
-        return follow(self._period[side], self._feedback[side], heeded, state[:, 72:88]).astype(np.float32)  # type: ignore[no-any-return]
+        return follow(self._period[side], self._feedback[side], heeded, state[:, 72:88]).astype(np.float32)

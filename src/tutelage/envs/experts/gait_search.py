@@ -223,7 +223,7 @@ def _evolve(config: SearchConfig, gaits: Array, generations: int, noise: float) 
             )
     trial.physics.close()
     check.physics.close()
-    return evolution.mean.reshape(gaits.shape)  # type: ignore[no-any-return]
+    return evolution.mean.reshape(gaits.shape)
 
 
 def _first_guess() -> Array:

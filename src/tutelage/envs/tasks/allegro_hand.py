@@ -84,7 +84,7 @@ class AllegroHand(GoalTask):
         """More the nearer the cube is to its orientation and its place, less for large actions; 250 for a goal."""
         away = np.linalg.norm(frame["qpos"][:, _CUBE] - REST, axis=1)
         cost = 10.0 * away + 0.0002 * np.square(actions).sum(axis=1)
-        return np.where(self.success(frame), 250.0, 0.0) + 1.0 / (self.angle(frame) + 0.1) - cost
+        return np.where(self.success(frame), 250.0, 0.0) + 1.0 / (self.angle(frame) + 0.1) - cost  # type: ignore[no-any-return]
 
     def success(self, frame: Frame) -> NDArray[np.bool_]:
         return np.asarray(self.angle(frame) <= TOLERANCE)
