@@ -258,13 +258,16 @@ def test_a_sweep_asks_for_what_exists() -> None:
         sweeps.SweepConfig(tasks=("Walker",))
 
 
-def test_figure_5_3_is_long_enough_for_two_episodes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_figure_5_3_is_long_enough_for_two_episodes_and_initial_periods(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     studies: list[Any] = []
     monkeypatch.setattr(reproduction, "run_study", studies.append)
     for full in (False, True):
-        reproduction.reproduce("figure-5.3", ("Walker2d", "Anymal"), (), full, 1, tmp_path, tmp_path)
+        reproduction.reproduce("figure-5.3", ("Walker2d", "Anymal", "AllegroHand"), (), full, 1, tmp_path, tmp_path)
     assert [(s.task, s.steps, s.evaluate) for s in studies] == [
-        ("Walker2d", 2000, 1000), ("Anymal", 5000, 2500), ("Walker2d", 10_000, 10_000), ("Anymal", 10_000, 10_000)
+        ("Walker2d", 2000, 1000), ("Anymal", 5000, 2500), ("AllegroHand", 5000, 1000),
+        ("Walker2d", 10_000, 10_000), ("Anymal", 10_000, 10_000), ("AllegroHand", 10_000, 10_000),
     ]  # fmt: skip
 
 

@@ -22,8 +22,8 @@ def reproduce(
             or "figure-C.2" to "figure-C.4".
         tasks: which tasks; empty: those of the figure, or Walker2d for those of appendix C.
         seeds: root seeds; empty: the figure's own number of them.
-        full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000 (Anymal, whose episodes have
-            2,500, has 5,000), figure-5.5 sees states in place of images,
+        full: the published scale. Else figure-5.3 has 2,000 timesteps in place of 10,000 (Anymal and AllegroHand
+            5,000: an episode, or the initial period of C.U.R., has 2,500), figure-5.5 sees states in place of images,
             figure-C.1 3,000, figures C.2 to C.4 2,000 and one seed in place of three; `gates`, which
             nobody published, 2,000 in place of 10,000; table-3.3 has 3 seeds and trains its networks on instead of anew;
             table-3.1 has the published scale in any case.
@@ -71,8 +71,9 @@ def reproduce(
         return tables(results / "fleet")
     ablations = what == "figure-C.1"
     for task in tasks or (("Walker2d",) if ablations else ("Walker2d", "Ant", "Humanoid", "Anymal")):
-        horizon = TASKS[task].horizon if task in TASKS else 1  # what is unknown, the study refuses
-        steps, evaluate = (max(3000, horizon), 0) if ablations else (max(2000, 2 * horizon), max(1000, horizon))
+        # Two episodes, and twice the initial period of C.U.R.; a task that is unknown, the study refuses.
+        horizon, initial = (TASKS[task].horizon, TASKS[task].initial_period) if task in TASKS else (1, 1)
+        steps, evaluate = max(3000 if ablations else 2000, 2 * horizon, 2 * initial), 0 if ablations else max(1000, horizon)
         if full:
             steps, evaluate = 10_000, 0 if ablations else 10_000
         run_study(

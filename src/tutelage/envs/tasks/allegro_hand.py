@@ -56,6 +56,7 @@ class AllegroHand(GoalTask):
     goes_on = True
     disturbance = "mild"
     offline_pairs = 1000
+    initial_period = 2500
     action_low, action_high = (-np.ones(16, dtype=np.float32), np.ones(16, dtype=np.float32))
     expert = "tutelage.envs.experts.allegro_hand:Turner"
     summary = "a hand of four fingers turns a cube about the vertical to goals; violation: cube dropped"
