@@ -59,7 +59,11 @@ def page(result: dict[str, Any]) -> str:
             if robots == 100:
                 row += _verdict(max(rates.values(), default=0.0), result["targets"].get(found["task"]))
             rows.append([f"{x:,}" if isinstance(x, int) else x for x in row])
-        head = [f"{robots} robots", *(f"{n} thr." for n in THREADS), *(["target", "reached"] if robots == 100 else [])]
+        head = [
+            f"{robots} robot{'s' if robots > 1 else ''}",
+            *(f"{n} thr." for n in THREADS),
+            *(["target", "reached"] if robots == 100 else []),
+        ]
         parts.append(table(head, rows))
     rows = []
     for task, rate in result["images a second"].items():

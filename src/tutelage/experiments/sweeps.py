@@ -127,9 +127,10 @@ def _of_task(sweep: Sweep, what: str, results: list[dict[str, Any]]) -> str:
     }
     values = [value for value in sweep.values if len(found["successes"][value])]
     others = [f"{s.symbol} = {s.default}" for s in SWEEPS.values() if s is not sweep]
+    seeds = len({r["seed"] for r in results})
     lines = [
         f"{c['task']}: C.U.R. with {c['robots']} robots, {c['steps']:,} timesteps, {', '.join(others)}, "
-        f"{len({r['seed'] for r in results})} seeds.",
+        f"{seeds} seed{'s' if seeds > 1 else ''}.",
         "",
         f"| {sweep.symbol} | " + " | ".join(column.title for column in ONLINE) + " |",
         "| ---: |" + " ---: |" * len(ONLINE),
