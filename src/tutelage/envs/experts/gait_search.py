@@ -5,9 +5,8 @@
     python -m tutelage.envs.experts.gait_search both --steps 200
 
 Candidates turn the cube for some seconds from the same starts; what counts is how far. First in calm, then with noise on the
-actions, where a gait also learns to heed the cube; at last both together,
-from goal to goal. The search is a covariance matrix adaptation with a diagonal matrix (Ros and Hansen,
-2008). It takes about ten minutes of one core each.
+actions, where a gait also learns to heed the cube; at last both together, from goal to goal. The search is a covariance
+matrix adaptation with a diagonal matrix (Ros and Hansen, 2008). It takes about ten minutes of one core each.
 """
 
 from __future__ import annotations
