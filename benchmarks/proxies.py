@@ -16,7 +16,6 @@ import json
 import multiprocessing
 import os
 import queue
-import socket
 import subprocess
 import sys
 import tempfile
@@ -28,13 +27,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.timing import table
+from tutelage.sgc.local import LocalFleet
 
 IMAGE = "sensor_msgs/msg/Image"
 SIZES = (64, 8192, 262_144, 14_000_000)
 FLOOD_BYTES = 1000
-POLICY = """
-version = 1
-"""
 TOPIC = """
 [topics.{alias}]
 node = "{sender}"
@@ -43,6 +40,13 @@ type = "{type}"
 owner = "{sender}"
 publish = ["{sender}"]
 subscribe = ["{receiver}"]
+"""
+TOPIC_ROUTE = """
+[[topic]]
+alias = "{alias}"
+domain = {domain}
+queue = 1000
+qos = {{depth = 1000}}
 """
 CYCLONE = """
 <CycloneDDS><Domain Id="any">
@@ -62,58 +66,30 @@ def run(quick: bool = False) -> dict[str, Any]:
     """Round trips in milliseconds, and messages a second."""
     os.environ["CYCLONEDDS_URI"] = CYCLONE.format(tag=f"benchmark-{os.getpid()}")
     with tempfile.TemporaryDirectory() as folder, _network(Path(folder)):
-        latency = _latency(20 if quick else 200)
-        floods = _floods(3 if quick else 9)
-        bridges = _rosbridge(Path(folder), 3 if quick else 9)
+        latency = _latency(20 if quick else 100)
+        floods = _floods(3 if quick else 5)
+        bridges = _rosbridge(Path(folder), 3 if quick else 5)
     head = ["round trip, ms", "direct p50", "p99", "router p50", "p99", "router / direct"]
-    rows = [
-        [f"{r['bytes']:,} B", r["direct_p50"], r["direct_p99"], r["router_p50"], r["router_p99"], r["ratio"]]
-        for r in latency
-    ]
-    print(table(head, rows))
+    columns = ("direct_p50", "direct_p99", "router_p50", "router_p99", "ratio")
+    print(table(head, [[f"{result['bytes']:,} B", *(result[column] for column in columns)] for result in latency]))
     print()
-    print(
-        table(
-            ["messages a second, 1000 B", "", ""], [[name, round(rate), ""] for name, rate in {**floods, **bridges}.items()]
-        )
-    )
+    print(table(["messages of 1000 B", "a second"], [[name, round(rate)] for name, rate in {**floods, **bridges}.items()]))
     return {"latency": latency, "rates": {**floods, **bridges}}
 
 
 @contextlib.contextmanager
 def _network(folder: Path) -> Iterator[None]:
-    """A fleet of two nodes with a proxy each, a router between them."""
-    from tutelage.sgc.access import Role
-    from tutelage.sgc.authority import Authority
-    from tutelage.sgc.home import Home
-
-    authority = Authority.create(folder / "authority", "bench")
-    pairs = {"there": ("near", "far"), "back": ("far", "near"), "web-there": ("near", "far")}
-    types = {"there": IMAGE, "back": IMAGE, "web-there": "std_msgs/msg/String"}
-    policy = POLICY + "".join(TOPIC.format(alias=a, sender=s, receiver=r, type=types[a]) for a, (s, r) in pairs.items())
-    (authority.path / "policy.toml").write_text(policy)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tls/127.0.0.1:{probe.getsockname()[1]}"
-    homes = {}
-    for name, role in (("router", Role.ROUTER), ("near", Role.NODE), ("far", Role.NODE)):
-        addresses = ["127.0.0.1"] if role == Role.ROUTER else []
-        homes[name] = Home.create(folder / name, name, role=role, addresses=addresses)
-        homes[name].accept(authority.issue(homes[name].request()))
-        (folder / name / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
-    for name, bundle in authority.publish().items():
-        homes[name].accept(bundle)
+    """Two nodes with a ROS 2 proxy each, a router between them, all in processes of their own; two nodes for rosbridges."""
+    pairs = {"there": ("near", "far"), "back": ("far", "near"), "web": ("web-near", "web-far")}
+    types = {"there": IMAGE, "back": IMAGE, "web": "std_msgs/msg/String"}
+    tables = (TOPIC.format(alias=a, sender=s, receiver=r, type=types[a]) for a, (s, r) in pairs.items())
+    fleet = LocalFleet(folder, "version = 1\n" + "".join(tables), ("near", "far", "web-near", "web-far"))
     for name, domain in (("near", NEAR), ("far", FAR)):
-        (folder / f"{name}.toml").write_text(
-            "version = 1\n"
-            + "".join(
-                f'[[topic]]\nalias = "{alias}"\ndomain = {domain}\nqueue = 1000\nqos = {{depth = 1000}}\n'
-                for alias in ("there", "back")
-            )
-        )
+        both = (TOPIC_ROUTE.format(alias=alias, domain=domain) for alias in ("there", "back"))
+        (folder / f"{name}.toml").write_text("version = 1\n" + "".join(both))
     with contextlib.ExitStack() as stack:
         for verb in (
-            ["router", str(folder / "router"), "--listen", address],
+            ["router", str(folder / "router-1"), "--listen", fleet.addresses[0]],
             ["proxy", "ros2", str(folder / "near"), str(folder / "near.toml")],
             ["proxy", "ros2", str(folder / "far"), str(folder / "far.toml")],
         ):
@@ -269,14 +245,15 @@ def _rosbridge(folder: Path, rounds: int) -> dict[str, float]:
     from websockets.sync.client import connect
 
     text = "x" * (FLOOD_BYTES - 9)  # with CDR's header and the length of the text: 1000 bytes
-    frame = json.dumps({"op": "publish", "topic": "/web_there", "msg": {"data": text}})
-    names = folder / "web.toml"
-    names.write_text('version = 1\n[[topic]]\nalias = "web-there"\nname = "/web_there"\nqueue = 1000\n')
+    frame = json.dumps({"op": "publish", "topic": "/web", "msg": {"data": text}})
+    routes = folder / "web.toml"
+    routes.write_text('version = 1\n[[topic]]\nalias = "web"\nqueue = 1000\n')
     rates: list[float] = []
-    arguments = ["--routes", str(names), "--listen", "127.0.0.1:0"]
+    arguments = ["--routes", str(routes), "--listen", "127.0.0.1:0"]
     with contextlib.ExitStack() as stack:
         near, far = (
-            stack.enter_context(_started(["proxy", "rosbridge", str(folder / name), *arguments])) for name in ("near", "far")
+            stack.enter_context(_started(["proxy", "rosbridge", str(folder / name), *arguments]))
+            for name in ("web-near", "web-far")
         )
         context = multiprocessing.get_context("spawn")
         counts = context.Queue()
@@ -305,7 +282,7 @@ def _listen(url: str, text: str, counts: Any) -> None:
 
     with connect(url, compression=None) as page:
         page.send(json.dumps({"op": "set_level", "level": "info"}))
-        page.send(json.dumps({"op": "subscribe", "topic": "/web_there"}))
+        page.send(json.dumps({"op": "subscribe", "topic": "/web"}))
         assert json.loads(page.recv())["level"] == "info"
         counts.put("ready")
         while True:

@@ -8,6 +8,7 @@ A block runs if the line before its fence is one of
 
     <!-- run -->            it must exit with 0
     <!-- run: output -->    (console blocks) and print what the page says
+    <!-- file: NAME -->     it is not run, but written to a file, for the blocks after it
 
 `python` blocks are programs, `console` blocks are lines of "$ command" and output, `sh` blocks are scripts. The blocks of
 one page share a folder and run in their order.
@@ -26,7 +27,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCK = re.compile(r"^<!-- run(?P<output>: output)? -->\n```(?P<kind>\w+)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(
+    r"^<!-- (?:run(?P<output>: output)?|file: (?P<file>[\w.-]+)) -->\n```(?P<kind>\w+)\n(?P<body>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
 OTHERWISE = "prints something else; run: python tests/run_examples.py --write"
 LIMIT = 300  # seconds; a hanging command must not hang the build
 
@@ -89,6 +93,9 @@ def run_page(path: Path, write: bool) -> int:
     with tempfile.TemporaryDirectory() as folder:
         for block in BLOCK.finditer(text):
             kind, body = block["kind"], block["body"]
+            if block["file"]:
+                (Path(folder) / block["file"]).write_text(body, encoding="utf-8")
+                continue
             outcome, shown = run_block(kind, body, Path(folder))
             stale = bool(block["output"]) and outcome.code == 0 and tidy(shown) != tidy(body)
             line = text.count("\n", 0, block.start()) + 3

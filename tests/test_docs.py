@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 import tomllib
 from functools import cache
@@ -97,6 +98,15 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_pages_of_the_site_link_to_nothing_outside_of_it() -> None:
     for page in (ROOT / "docs").rglob("*.md"):
         assert "](../" not in page.read_text(encoding="utf-8"), name(page)
+
+
+# -- tables ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_tables_of_speed_are_those_of_the_results() -> None:
+    command = [sys.executable, "-m", "benchmarks.pages", "--check"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 # -- commands -------------------------------------------------------------------------------------------------------------

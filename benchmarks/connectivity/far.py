@@ -1,12 +1,14 @@
 """`python -m benchmarks.connectivity.far STACK SETUP`: the other process. Answers commands on standard input, a line each.
 
 echo            from now on, send back what comes
+digest          from now on, send back the SHA-256 of what comes
 sink            from now on, count what comes and check it
 report          print what was counted, as JSON
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 import time
@@ -36,14 +38,14 @@ def main() -> None:
     """Entry point."""
     stack, setup = sys.argv[1], json.loads(sys.argv[2])
     sink = Sink(b"")
-    echoing = True
+    mode = "echo"
     link: Link
 
     def on_bytes(payload: bytes) -> None:
-        if echoing:
-            link.send(payload)
-        else:
+        if mode == "sink":
             sink.take(payload)
+        else:
+            link.send(payload if mode == "echo" else hashlib.sha256(payload).digest())
 
     link = open_link(stack, FAR, setup, on_bytes)
     print(json.dumps({"up": True}), flush=True)
@@ -51,9 +53,9 @@ def main() -> None:
         command = line.strip()
         answer: dict[str, Any] = {}
         if command == "sink":
-            sink, echoing = Sink(bytes(range(256)) * 3 + bytes(224)), False
-        elif command == "echo":
-            echoing = True
+            sink = Sink(bytes(range(256)) * 3 + bytes(224))
+        if command in ("sink", "echo", "digest"):
+            mode = command
         else:
             answer = {
                 "count": sink.count,

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.connectivity.route HOME ADDRESS...` or `... plain PORT`: a router until standard input ends."""
+"""`python -m benchmarks.connectivity.route HOME ADDRESS...` or `... plain ADDRESS`: a router until standard input ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def main() -> None:
         from tutelage.sgc.transport.config import Timers, import_zenoh, zenoh_config, zenoh_settings
 
         settings = zenoh_settings("router", Timers(), None)
-        settings["listen"] = {"endpoints": [f"tcp/127.0.0.1:{sys.argv[2]}"]}
+        settings["listen"] = {"endpoints": [sys.argv[2]]}
         session = import_zenoh().open(zenoh_config(settings))
         print(json.dumps(str(session.zid())), flush=True)
         sys.stdin.read()

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from benchmarks.connectivity.stacks import FAR, NEAR
+from benchmarks.connectivity.stacks import FAR, NEAR, OURS, OVER_QUIC, alias
+from tutelage.sgc import lanes
 from tutelage.sgc.local import LocalFleet
-from tutelage.sgc.transport.config import Endpoint, NetworkConfig
 
 LOOPBACK = """<CycloneDDS><Domain Id="any">
 <General>
@@ -27,7 +27,9 @@ LOOPBACK = """<CycloneDDS><Domain Id="any">
 """Cyclone DDS must not leave the machine, finds its peers without multicast, and is tuned for large messages on loopback."""
 
 
-MODES = {"signature": "signature", "session": "session", "chain": "chain", "provisional": "chain"}
+MODES = {alias(stack): stack.split(", ")[0] for stack in (*OURS, *OVER_QUIC)}
+"""Kind of authenticity, by the first part of the aliases."""
+
 PLAIN = ("tcp", "tls", "quic")
 """Protocols of Zenoh alone; each has names of its own, as two of them share a router."""
 
@@ -60,27 +62,33 @@ def free_ports(count: int) -> list[int]:
 
 
 @contextmanager
-def prepare(folder: Path) -> Iterator[dict[str, Any]]:
-    """What all processes are told; routers run in processes of their own until the end."""
+def prepare(folder: Path, host: str = "127.0.0.1", inside: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
+    """What all processes are told; routers run in processes of their own until the end.
+
+    host: where routers and servers listen. inside: words before the commands of the far side, such as ip netns exec.
+    """
     os.environ["CYCLONEDDS_URI"] = LOOPBACK
-    homes = LocalFleet(folder, policy(), (NEAR, FAR)).homes
-    sockets, rosbridge, tcp, tls, quic = free_ports(5)
-    for name in (NEAR, FAR):
-        NetworkConfig((Endpoint("tls", "127.0.0.1", tls),)).save(homes[name].path)
+    homes = LocalFleet(folder, policy(), (NEAR, FAR), host=host).homes
     topics = homes[NEAR].access.topics
-    names = {each: {way: topics[f"{each}-{way}"].name.hex() for way in ("there", "back")} for each in PLAIN}
-    ports = {"sockets": sockets, "rosbridge": rosbridge, "zenoh tcp": tcp, "zenoh mtls": tls, "zenoh quic": quic}
+    keys = {
+        each: {way: lanes.key(topics[f"{each}-{way}"].name, lanes.STREAM) for way in ("there", "back")} for each in PLAIN
+    }
+    ports = dict(zip(("sockets", "rosbridge", *PLAIN), free_ports(5), strict=True))
     setup = {
         "homes": {name: str(home.path) for name, home in homes.items()},
-        "names": names,
+        "keys": keys,
+        "host": host,
         "ports": ports,
+        "inside": list(inside),
     }
+    tls, quic = (f"{protocol}/{host}:{ports[protocol]}" for protocol in ("tls", "quic"))
     with ExitStack() as stack:
-        for arguments in (
-            ("plain", str(tcp)),
-            (str(homes["router-1"].path), f"tls/127.0.0.1:{tls}", f"quic/127.0.0.1:{quic}"),
+        for program, *arguments in (
+            ("route", "plain", f"tcp/{host}:{ports['tcp']}"),
+            ("route", str(homes["router-1"].path), tls, quic),
+            ("hub", host, str(ports["rosbridge"])),
         ):
-            command = [sys.executable, "-m", "benchmarks.connectivity.route", *arguments]
+            command = [*inside, sys.executable, "-m", f"benchmarks.connectivity.{program}", *arguments]
             router = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             stack.callback(router.kill)
             assert router.stdout

@@ -7,9 +7,11 @@ zenoh mtls          the same with TLS and certificates on both sides; the router
 zenoh quic          the same over QUIC
 signature           ours: sealed end to end and signed, over zenoh mtls
 session             ours, with the key of a session instead of a signature
+session, direct     the same, with the callback on the network's thread, as Zenoh has it in the rows above
 chain               ours, with a signed chain
 chain, provisional  the same, delivered before the chain confirms it
-rosbridge           what rosbridge does to a message (JSON, base64, WebSocket), without its other work
+..., quic           over zenoh quic
+rosbridge           what rosbridge does to a message, without ROS: a server between the two (`hub`), JSON, base64, WebSocket
 """
 
 from __future__ import annotations
@@ -26,8 +28,10 @@ from pathlib import Path
 from typing import Any
 
 OnBytes = Callable[[bytes], Any]
-OURS = ("signature", "session", "chain", "chain, provisional")
+OURS = ("signature", "session", "session, direct", "chain", "chain, provisional")
+OVER_QUIC = ("signature, quic", "session, quic")
 STACKS = ("sockets", "cyclone", "zenoh tcp", "zenoh mtls", "zenoh quic", *OURS, "rosbridge")
+WAN = ("sockets", "zenoh mtls", "zenoh quic", "signature", "session", *OVER_QUIC, "rosbridge")
 NEAR, FAR = "near", "far"
 """The two processes, and the two nodes of the fleet."""
 
@@ -59,9 +63,9 @@ def open_link(stack: str, side: str, setup: dict[str, Any], on_bytes: OnBytes) -
     setup: what both sides know: ports, folders.
     """
     if stack == "sockets":
-        return Sockets(side, setup["ports"][stack], on_bytes)
+        return Sockets(side, setup["host"], setup["ports"][stack], on_bytes)
     if stack == "rosbridge":
-        return Rosbridge(side, setup["ports"][stack], on_bytes)
+        return Rosbridge(side, setup["host"], setup["ports"][stack], on_bytes)
     if stack == "cyclone":
         return Cyclone(side, on_bytes)
     if stack.startswith("zenoh"):
@@ -72,15 +76,15 @@ def open_link(stack: str, side: str, setup: dict[str, Any], on_bytes: OnBytes) -
 class Sockets(Link):
     """Each message after its length."""
 
-    def __init__(self, side: str, port: int, on_bytes: OnBytes) -> None:
+    def __init__(self, side: str, host: str, port: int, on_bytes: OnBytes) -> None:
         self._on_bytes = on_bytes
         self._socket: socket.socket | None = None
         self._listening: socket.socket | None = None
         if side == FAR:
-            self._listening = socket.create_server(("127.0.0.1", port))
+            self._listening = socket.create_server((host, port))
             threading.Thread(target=self._accept, daemon=True).start()
         else:
-            self._begin(socket.create_connection(("127.0.0.1", port)))
+            self._begin(socket.create_connection((host, port)))
 
     def _accept(self) -> None:
         assert self._listening
@@ -161,22 +165,26 @@ class Cyclone(Link):
         self._closed = True
 
 
+def transport(protocol: str, side: str, setup: dict[str, Any]) -> Any:
+    """Our transport, to the router of a protocol: tcp without certificates, tls, quic."""
+    from tutelage.sgc.transport.config import Endpoint, Identity, NetworkConfig
+    from tutelage.sgc.transport.zenoh import ZenohTransport
+
+    home = Path(setup["homes"][side])
+    identity = None if protocol == "tcp" else Identity(home / "root.pem", home / "leaf.pem", home / "signing.key")
+    return ZenohTransport(NetworkConfig((Endpoint(protocol, setup["host"], setup["ports"][protocol]),)), identity)
+
+
 class Zenoh(Link):
     """Our transport without anything on top."""
 
     def __init__(self, stack: str, side: str, setup: dict[str, Any], on_bytes: OnBytes) -> None:
-        from tutelage.sgc.transport.config import Endpoint, Identity, NetworkConfig
-        from tutelage.sgc.transport.zenoh import ZenohTransport
-
         protocol = {"zenoh tcp": "tcp", "zenoh mtls": "tls", "zenoh quic": "quic"}[stack]
-        home = Path(setup["homes"][side])
-        identity = None if protocol == "tcp" else Identity(home / "root.pem", home / "leaf.pem", home / "signing.key")
-        where = Endpoint(protocol, "127.0.0.1", setup["ports"][stack])
-        self._transport = ZenohTransport(NetworkConfig((where,)), identity)
-        names = setup["names"][protocol]
+        self._transport = transport(protocol, side, setup)
+        keys = setup["keys"][protocol]
         out, back = ("there", "back") if side == NEAR else ("back", "there")
-        self._out, back = f"{names[out]}/stream", f"{names[back]}/stream"
-        self._transport.subscribe(back, on_bytes)
+        self._out = keys[out]
+        self._transport.subscribe(keys[back], on_bytes)
 
     def send(self, payload: bytes) -> None:
         self._transport.publish(self._out, payload)
@@ -191,11 +199,16 @@ class Ours(Link):
     def __init__(self, stack: str, side: str, setup: dict[str, Any], on_bytes: OnBytes) -> None:
         from tutelage.sgc.node import Node
 
-        topic = stack.rpartition(", ")[2]
-        out, back = (f"{topic}-{way}" for way in (("there", "back") if side == NEAR else ("back", "there")))
-        self._node = Node.open(Path(setup["homes"][side]))
+        _, *options = stack.split(", ")
+        out, back = (f"{alias(stack)}-{way}" for way in (("there", "back") if side == NEAR else ("back", "there")))
+        self._transport = transport("quic" if "quic" in options else "tls", side, setup)
+        self._node = Node.open(Path(setup["homes"][side]), self._transport)
         self._subscription = self._node.subscribe(
-            back, lambda message: on_bytes(message.payload), queue=1024, provisional=topic == "provisional"
+            back,
+            lambda message: on_bytes(message.payload),
+            queue=1024,
+            provisional="provisional" in options,
+            direct="direct" in options,
         )
         self._publisher = self._node.publisher(out)
 
@@ -210,36 +223,34 @@ class Ours(Link):
 
     def close(self) -> None:
         self._node.close()
+        self._transport.close()
+
+
+def alias(stack: str) -> str:
+    """The first part of the aliases of a stack's two topics."""
+    return stack.replace(", ", "-")
 
 
 class Rosbridge(Link):
-    """The protocol of rosbridge v2 on one topic, by the fastest JSON and base64 of the standard library."""
+    """A client of `hub`, by the fastest JSON and base64 of the standard library."""
 
-    def __init__(self, side: str, port: int, on_bytes: OnBytes) -> None:
-        from websockets.sync import client, server
+    def __init__(self, side: str, host: str, port: int, on_bytes: OnBytes) -> None:
+        from websockets.sync.client import connect
 
         self._on_bytes = on_bytes
-        self._socket: Any = None
-        self._server: Any = None
-        options: dict[str, Any] = {"max_size": None, "compression": None}
-        if side == FAR:
-            self._server = server.serve(self._read, "127.0.0.1", port, **options)
-            threading.Thread(target=self._server.serve_forever, daemon=True).start()
-        else:
-            self._socket = client.connect(f"ws://127.0.0.1:{port}", proxy=None, **options)
-            threading.Thread(target=self._read, args=(self._socket,), daemon=True).start()
+        out, back = ("/there", "/back") if side == NEAR else ("/back", "/there")
+        self._out = out
+        self._socket = connect(f"ws://{host}:{port}", proxy=None, max_size=None, compression=None)
+        self._socket.send(json.dumps({"op": "subscribe", "topic": back}))
+        threading.Thread(target=self._read, daemon=True).start()
 
-    def _read(self, connected: Any) -> None:
-        self._socket = connected
-        for text in connected:
+    def _read(self) -> None:
+        for text in self._socket:
             self._on_bytes(base64.b64decode(json.loads(text)["msg"]["data"]))
 
     def send(self, payload: bytes) -> None:
         data = base64.b64encode(payload).decode()
-        self._socket.send(json.dumps({"op": "publish", "topic": "/there", "msg": {"data": data}}))
+        self._socket.send(json.dumps({"op": "publish", "topic": self._out, "msg": {"data": data}}))
 
     def close(self) -> None:
-        if self._server is not None:
-            self._server.shutdown()
-        if self._socket is not None:
-            self._socket.close()
+        self._socket.close()

@@ -56,7 +56,10 @@ def test_only_the_owner_answers_for_keys_and_only_servers_serve() -> None:
 
 def test_a_node_without_topics_hears_only_notices_and_announces_only_itself() -> None:
     keys = {key for _, _, key in allowed(access_control(ROUTES, NODES, set(), CONTROL), "other")}
-    assert keys == {lanes.key(CONTROL, lane) for lane in (lanes.DENY, lanes.RENEW)} | {"*/here/other", "*/echo/other"}
+    assert keys == {lanes.key(CONTROL, lane) for lane in (lanes.DENY, lanes.RENEW, lanes.RULES)} | {
+        "*/*/*/here/other",
+        "*/*/*/echo/other",
+    }
 
 
 def test_nobody_announces_another() -> None:
@@ -66,7 +69,7 @@ def test_nobody_announces_another() -> None:
             for flow, message, key in allowed(access_control(ROUTES, NODES, set(), CONTROL), who)
             if (flow, message) == ("ingress", "liveliness_token")
         }
-        assert tokens == {f"*/here/{who}"}
+        assert tokens == {f"*/*/*/here/{who}"}
 
 
 def test_routers_pass_on_anything_and_the_revoked_nothing() -> None:

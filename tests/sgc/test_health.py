@@ -11,7 +11,8 @@ import pytest
 from sgc.fleets import Fleet, eventually, topic
 
 from tutelage.errors import ConfigError
-from tutelage.sgc.health import HealthServer, node_health, prometheus
+from tutelage.sgc.health import node_health, prometheus
+from tutelage.sgc.health_server import HealthServer
 from tutelage.sgc.node import Node
 from tutelage.sgc.transport.memory import MemoryTransport, Network
 

@@ -58,3 +58,14 @@ def test_any_bytes_are_an_answer_or_refused(data: bytes) -> None:
     else:
         assert sum(len(packet) + 4 for packet in packets) + 8 == len(data)
         assert floor >= 0
+
+
+def test_an_answer_that_is_cut_short_ends_with_what_confirms_it() -> None:
+    history = History()
+    for number in range(1, 21):
+        history.add(number, number, bytes([number]) * 100, 0.0, confirms=number % 8 == 0)
+    everything = [(1, 20)]
+    assert [packet[0] for packet in history.find(everything, 300)[1]] == [1, 2, 3, 8]
+    assert [packet[0] for packet in history.find([(4, 7), (9, 20)], 300)[1]] == [4, 5, 6, 16]  # 8 came, so it is known
+    assert [packet[0] for packet in history.find([(6, 20)], 300)[1]] == [6, 7, 8]
+    assert [packet[0] for packet in history.find([(17, 20)], 300)[1]] == [17, 18, 19]  # its anchor is still to come

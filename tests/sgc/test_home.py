@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from members import POLICY, Fleet
 
 from tutelage.sgc import trust as trust_module
+from tutelage.sgc.bundle import CONTEXT
 from tutelage.sgc.certificates import pem
+from tutelage.sgc.envelope import open_sealed, seal_to
 from tutelage.sgc.errors import KeysError, NotIssued
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Reason, Refused
@@ -140,6 +142,17 @@ def test_a_bundle_brings_the_deny_list_along(fleet: Fleet) -> None:
 def test_another_nodes_bundle_is_refused(fleet: Fleet) -> None:
     bundle = fleet.authority.renew(fleet.homes["server"].request())
     assert reason(fleet.homes["drone-1"].accept, bundle) == Reason.NOT_FOR_US
+
+
+def test_a_bundle_that_its_node_seals_anew_for_another_is_refused(fleet: Fleet) -> None:
+    giver, taker = fleet.homes["server"], fleet.homes["drone-1"]
+    bundle = fleet.authority.renew(giver.request())
+    magic = bundle[: bundle.index(b"\n") + 1]
+    inside = open_sealed(giver.sealing_key, CONTEXT, bundle[len(magic) :])
+    again = magic + seal_to(taker.sealing_key.public_key(), CONTEXT, inside)
+    with pytest.raises(Refused, match="a bundle that was sealed to another node first") as raised:
+        taker.accept(again)
+    assert raised.value.reason == Reason.NOT_FOR_US
 
 
 def test_another_fleet_cannot_take_a_node_over(fleet: Fleet, tmp_path) -> None:

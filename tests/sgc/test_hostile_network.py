@@ -19,6 +19,7 @@ from sgc.fleets import Fleet, eventually, service, topic
 
 from tutelage.sgc import delivery, lanes
 from tutelage.sgc.messages import Message
+from tutelage.sgc.names import Name
 from tutelage.sgc.node import Node
 from tutelage.sgc.transport.base import NoReply
 from tutelage.sgc.transport.memory import MemoryTransport, Network
@@ -31,9 +32,9 @@ POLICY += service("grasp", ["server"], ["arm"])
 class Wire:
     """What the router does with packets of the streams: passes them on, or as it is told."""
 
-    def __init__(self, network: Network, names: set[str]) -> None:
+    def __init__(self, network: Network, name: Name) -> None:
         self.network = network
-        self.names = names
+        self.name = name
         self.drop = self.twice = self.hold = False
         self.rewrite: int | None = None
         self.held: list[tuple[str, bytes]] = []
@@ -42,7 +43,7 @@ class Wire:
         network.tap = self.carry
 
     def carry(self, key: str, packet: bytes) -> list[tuple[str, bytes]]:
-        if not any(key == f"{name}/{lanes.STREAM}" for name in self.names):
+        if key != lanes.key(self.name, lanes.STREAM):
             return [(key, packet)]
         with self.lock:
             self.seen = [*self.seen[-50:], (key, packet)]
@@ -74,7 +75,7 @@ class HostileRouter(RuleBasedStateMachine):
         self.publisher = self.arm.publisher(self.alias)
         self.sent = 0
         eventually(lambda: self.publisher.send(b"hello") or self.sent_before, every=0.02)
-        self.wire = Wire(self.network, {self.arm.access.entry(self.alias).name.hex()})
+        self.wire = Wire(self.network, self.arm.access.entry(self.alias).name)
 
     sent_before = False
 
@@ -118,13 +119,9 @@ class HostileRouter(RuleBasedStateMachine):
 
     @rule(junk=st.binary(max_size=300))
     def invent_a_packet(self, junk: bytes) -> None:
-        for name in self.wire.names:
-            self.network.deliver(f"{name}/{lanes.STREAM}", junk)
-            self.network.deliver(f"{name}/{lanes.HELLO}", junk)
-            self.network.deliver(f"{name}/{lanes.OFFER}", junk)
-            self.network.deliver(f"{name}/{lanes.ANSWER}", junk)
-            self.network.deliver(f"{name}/{lanes.GRANTS}", junk)
-        self.network.deliver(f"{self.arm.access.control.hex()}/{lanes.DENY}", junk)
+        for lane in (lanes.STREAM, lanes.HELLO, lanes.OFFER, lanes.ANSWER, lanes.GRANTS):
+            self.network.deliver(lanes.key(self.wire.name, lane), junk)
+        self.network.deliver(lanes.key(self.arm.access.control, lanes.DENY), junk)
 
     @rule(answer=st.none() | st.binary(max_size=60))
     def spoil_answers(self, answer: bytes | None) -> None:

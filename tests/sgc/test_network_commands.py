@@ -5,12 +5,14 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 from sgc.fleets import Fleet, Programs, free_port, topic
 
 from tutelage.cli import main
+from tutelage.sgc.commands.stopping import Stop, until_stopped
 from tutelage.sgc.transport.config import Endpoint, NetworkConfig
 
 pytest.importorskip("zenoh", reason="needs the extra sgc")
@@ -81,3 +83,10 @@ def test_faults_are_one_line_that_names_the_remedy(fleet: Fleet, tmp_path: Path,
     NetworkConfig((Endpoint("tls", "127.0.0.1", free_port()),)).save(fleet["arm"].path)
     assert "arm reaches none of its routers" in fails(["ping", arm, "--timeout", "0.2"], capsys)
     assert "arm is not in subscribe of topic 'log'" in fails(["top", arm, "--topics", "log"], capsys)
+
+
+def test_a_signal_that_another_thread_takes_stops_a_program_as_well() -> None:
+    with until_stopped() as stop:
+        threading.Timer(0.1, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGTERM)).start()
+        assert stop.wait(10.0)
+    assert not Stop().wait(0.01)

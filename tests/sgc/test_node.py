@@ -12,8 +12,10 @@ import pytest
 from sgc.fleets import Fleet, eventually, service, topic
 
 from tutelage.errors import ConfigError
+from tutelage.sgc import lanes
 from tutelage.sgc import publisher as publishing
 from tutelage.sgc.errors import NotAllowed, NotIssued
+from tutelage.sgc.history import make_request
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
 from tutelage.sgc.service import RequestFailed
@@ -112,6 +114,28 @@ def test_iterating_over_a_subscription(arm: Node, server: Node) -> None:
     assert list(subscription) == []
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_a_direct_subscription_gets_the_same_on_the_networks_thread(
+    network: Network, arm: Node, server: Node, mode: str
+) -> None:
+    got, threads = Received(), set[str]()
+    server.subscribe(f"log-{mode}", lambda m: (threads.add(threading.current_thread().name), got(m))[0], direct=True)
+    log = arm.publisher(f"log-{mode}")
+    acquainted(log.send, got)
+    threads.clear()
+    for k in range(300):
+        network.up = not 100 <= k < 150  # what is lost is fetched again
+        log.send(b"%d" % k)
+        log.flush(1.0)
+    eventually(lambda: in_order(got, 300))
+    assert any(not name.startswith("sgc-subscribe") for name in threads)
+
+
+def test_a_direct_subscription_needs_a_callback(server: Node) -> None:
+    with pytest.raises(ConfigError, match="a direct subscription of log-signature needs a callback"):
+        server.subscribe("log-signature", direct=True)
+
+
 def test_messages_wait_for_the_key_until_its_owner_is_there(tmp_path: Path, network: Network) -> None:
     fleet = Fleet(tmp_path, POLICY, ["arm", "server"])
     with Node.open(fleet["server"], MemoryTransport(network)) as server:
@@ -161,6 +185,25 @@ def test_the_last_message_is_not_missed_either(network: Network, arm: Node, serv
     log.send(b"0")
     network.up = True
     eventually(lambda: in_order(got, 1))
+
+
+def test_a_subscriber_that_is_about_to_miss_something_is_waited_for(arm: Node) -> None:
+    log = arm.publisher("log-signature")
+    log._history._limit = 100
+    for k in range(100):
+        log.send(b"%d" % k)
+        log.flush(1.0)  # a packet each
+    log._free_at = 0.0
+    log._replay(make_request([(90, 90)]))
+    assert log._free_at == 0.0
+    now = time.monotonic()
+    log._replay(make_request([(10, 20)]))
+    assert log._free_at > now
+    log.send(b"waits in the queue")
+    eventually(lambda: log.queued == 0)
+    waited = log._free_at
+    log._replay(make_request([(10, 20)]))  # nothing came of it: whoever is stuck is not waited for again
+    assert log._free_at <= max(waited, time.monotonic() + log._spacing)
 
 
 def test_a_publisher_that_is_gone_leaves_a_counted_gap(fleet: Fleet, network: Network, server: Node) -> None:
@@ -306,7 +349,8 @@ def test_a_reply_to_another_request_is_refused(network: Network, arm: Node, serv
     with server.serve("grasp", lambda asked: asked.payload):
         arm.request("grasp", b"to get acquainted")
         replies: list[bytes] = []
-        network.answer_tap = lambda key, reply: replies.append(reply) or replies[0]
+        calls = lanes.key(arm.access.entry("grasp").name, lanes.CALL)
+        network.answer_tap = lambda key, reply: reply if key != calls else replies.append(reply) or replies[0]
         assert arm.request("grasp", b"0") == b"0"
         with pytest.raises(NoReply, match="refused"):
             arm.request("grasp", b"1")
@@ -326,7 +370,7 @@ def test_peers_are_known_by_name_and_can_be_pinged(arm: Node, server: Node) -> N
 
 def test_an_invented_presence_is_no_peer(network: Network, arm: Node) -> None:
     name = arm.access.entry("camera").name
-    with MemoryTransport(network).announce(f"{name.hex()}/here/{'ab' * 16}"):
+    with MemoryTransport(network).announce(lanes.key(name, lanes.HERE, "ab" * 16)):
         assert arm.peers(timeout=0.2) == []
 
 

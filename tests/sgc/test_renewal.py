@@ -14,8 +14,9 @@ from tutelage.sgc import lanes
 from tutelage.sgc import renewal as renewal_module
 from tutelage.sgc.home import Home
 from tutelage.sgc.node import Node
+from tutelage.sgc.office import Office
 from tutelage.sgc.reasons import Reason, Refused
-from tutelage.sgc.renewal import Office, Renewer, due, question
+from tutelage.sgc.renewal import Renewer, due, question
 from tutelage.sgc.rules import Role
 from tutelage.sgc.transport.base import NoReply
 from tutelage.sgc.transport.memory import MemoryTransport, Network

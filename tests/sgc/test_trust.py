@@ -16,6 +16,7 @@ from members import Fleet
 from tutelage.errors import ConfigError
 from tutelage.sgc import certificates
 from tutelage.sgc.certificates import Keys, der, raw
+from tutelage.sgc.privatekeys import load_signing_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import Role
 from tutelage.sgc.signed import sign
@@ -118,6 +119,15 @@ def test_no_node_can_make_credentials_of_its_own(fleet: Fleet, stranger: Fleet) 
     assert reason(trust.verify, pack(drone_leaf, authority, server_membership)) == Reason.WRONG_AUTHORITY
     _, _, other_fleets = unpack(stranger.homes["drone-1"].credential, 3)
     assert reason(trust.verify, pack(drone_leaf, authority, other_fleets)) == Reason.WRONG_AUTHORITY
+
+
+def test_what_the_root_signed_for_another_purpose_is_no_authority(fleet: Fleet) -> None:
+    root_key = load_signing_key(fleet.authority.path / "root" / "root.key")
+    own = Ed25519PrivateKey.generate()
+    keys = Keys("ab" * 16, Role.NODE, own.public_key(), X25519PrivateKey.generate().public_key())
+    leaf = certificates.leaf_certificate(keys, fleet.authority.root, root_key, time.time(), 24)
+    statement = membership("server", keys.common_name, raw(keys.signing), raw(keys.sealing))
+    assert reason(fleet.homes["server"].trust.verify, forged(leaf, own, keys, statement, own)) == Reason.WRONG_AUTHORITY
 
 
 def test_the_authority_itself_is_no_member(fleet: Fleet) -> None:

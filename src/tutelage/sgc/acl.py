@@ -62,11 +62,12 @@ def access_control(
         _of_route(grants, route)
     for who in members:
         _allow(grants, {who}, (*PUBLISH, *SUBSCRIBE), lanes.key(control, lanes.DENY))
+        _allow(grants, {who}, ASK, lanes.key(control, lanes.RULES))  # the router itself answers
         _allow(grants, {who}, SERVE if who == office else ASK, lanes.key(control, lanes.RENEW))
     rules, subjects, policies = [], [], []
     for who in sorted(set(grants) - denied):
         allowed = grants[who]
-        own = [f"*/{lanes.HERE}/{who}"], [f"*/{lanes.ECHO}/{who}"]  # under a name that only members know
+        own = [f"*/*/*/{lanes.HERE}/{who}"], [f"*/*/*/{lanes.ECHO}/{who}"]  # under a name that only members know
         for grant, keys in zip((ANNOUNCE, SERVE), own, strict=True):
             for flow, message in grant:
                 allowed[flow, message] += keys

@@ -135,6 +135,12 @@ class Authority:
         """Names of the routers that are members."""
         return [name for name, record in self._roster.members.items() if record.keys.role == Role.ROUTER]
 
+    @property
+    def unsigned(self) -> bool:
+        """Has the policy file changed since `publish`?"""
+        file, signed = self.path / "policy.toml", self.path / "published.toml"
+        return file.is_file() and file.read_bytes() != signed.read_bytes()
+
     def refresh(self) -> None:
         """Read again what another process changed."""
         with self._lock:

@@ -31,6 +31,9 @@ class Kind(IntEnum):
     LIFE = 2  # nothing but a sequence number: shows that the sender lives and what it has sent so far
 
 
+_WHOLE = bytes([Kind.WHOLE])
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """A frame, read.
@@ -105,6 +108,16 @@ class Assembly:
         self._next = 0  # sequence number of the piece that must come now
         self.broken = 0
         """Messages of which a piece is missing."""
+
+    def take(self, sequence: int, payload: bytes) -> bytes | None:
+        """The message that a frame, not yet read, completes, if any.
+
+        Raises:
+            Refused: MALFORMED.
+        """
+        if not self._parts and payload[:1] == _WHOLE and len(payload) >= _HEAD.size:  # as nearly all are
+            return payload[_HEAD.size :]
+        return self.add(sequence, parse(payload))
 
     def add(self, sequence: int, frame: Frame) -> bytes | None:
         """The message that this frame completes, if any."""

@@ -1,20 +1,10 @@
-"""What a node or router counts, as a tree, as Prometheus text, and over HTTP: `/healthz` and `/metrics` on loopback.
-
-`/healthz` answers 200 while the node is connected to a router, holds its topics' keys, and its certificate is valid for
-another five minutes; else 503. The body says why, in JSON.
-"""
+"""What a node or router counts, as a tree and as Prometheus text, and whether it is well. Over HTTP: `health_server`."""
 
 from __future__ import annotations
 
-import json
-import threading
 import time
-from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
-
-from tutelage.errors import ConfigError
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tutelage.sgc.node import Node
@@ -88,10 +78,9 @@ def node_health(node: Node) -> Tree:
         problems.append("not connected to a router")
     if left < EXPIRES_SOON:
         problems.append(f"the certificate ends in {left:.0f} s" if left > 0 else "the certificate has expired")
-    wanted = node.keyring.wanted()
-    missing = [alias for alias in wanted if node.keyring.epoch(alias) is None]
-    if missing:
+    if missing := node.lacking():
         problems.append(f"no key yet of: {', '.join(missing)}")
+    problems += node.diagnosis.problems()
     return {"ok": not problems, "node": node.name, "problems": problems, "certificate_expires_in": left}
 
 
@@ -153,67 +142,3 @@ def _sum(a: Tree, b: Tree) -> Tree:
         both = isinstance(value, dict) and isinstance(total.get(key), dict)
         total[key] = _sum(total[key], value) if both else value if key not in total else total[key] + value
     return total
-
-
-class HealthServer:
-    """Serves `/healthz` and `/metrics`."""
-
-    def __init__(self, address: str, health: Callable[[], Tree], metrics: Callable[[], Tree]) -> None:
-        """
-        Args:
-            address: HOST:PORT; loopback unless somebody else is meant to see how many messages go where.
-
-        Raises:
-            ConfigError: the address is impossible or in use.
-        """
-        host, _, port = address.rpartition(":")
-        if not host or not port.isdigit() or int(port) > 65535:
-            raise ConfigError(f"{address!r} is no address to serve health on; write HOST:PORT, such as 127.0.0.1:9090")
-
-        class Handler(BaseHTTPRequestHandler):
-            timeout = 5.0
-
-            def do_GET(self) -> None:
-                path = self.path.partition("?")[0]
-                if path == "/healthz":
-                    state = health()
-                    self._answer(200 if state["ok"] else 503, "application/json", json.dumps(state) + "\n")
-                elif path == "/metrics":
-                    self._answer(200, "text/plain; version=0.0.4; charset=utf-8", prometheus(metrics()))
-                else:
-                    self._answer(404, "text/plain; charset=utf-8", "there are /healthz and /metrics\n")
-
-            def _answer(self, code: int, kind: str, text: str) -> None:
-                body = text.encode()
-                self.send_response(code)
-                self.send_header("Content-Type", kind)
-                self.send_header("Content-Length", str(len(body)))
-                self.end_headers()
-                self.wfile.write(body)
-
-            def log_message(self, format: str, *args: Any) -> None:
-                return
-
-        try:
-            self._server = ThreadingHTTPServer((host.strip("[]"), int(port)), Handler)
-        except OSError as error:
-            raise ConfigError(f"cannot serve health on {address}: {error.strerror}") from None
-        self._server.daemon_threads = True
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="sgc-health", daemon=True)
-        self._thread.start()
-
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return int(self._server.server_address[1])
-
-    def close(self) -> None:
-        """Stop."""
-        self._server.shutdown()
-        self._server.server_close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

@@ -11,7 +11,7 @@ import struct
 import threading
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 from tutelage.sgc.reasons import Reason, Refused
 
@@ -21,6 +21,9 @@ ANSWER = 256 << 10
 """Bytes of an answer, unless a single packet is larger."""
 RANGES = 64
 """Of a request."""
+
+_Kept = tuple[int, int, float, bytes | bytearray, bool]
+"""Last and first sequence number, when, packet, does it confirm others?"""
 
 _RANGE = struct.Struct(">QQ")
 _FLOOR = struct.Struct(">Q")
@@ -38,17 +41,20 @@ class History:
         """
         self._limit, self._size, self._max_age = packets, size, max_age
         self._lock = threading.Lock()
-        self._packets: deque[tuple[int, int, float, bytes | bytearray]] = deque()  # last, first, when, packet
+        self._packets: deque[_Kept] = deque()
         self._held = 0
+        self._confirms = False
 
-    def add(self, first: int, last: int, packet: bytes | bytearray, now: float) -> None:
+    def add(self, first: int, last: int, packet: bytes | bytearray, now: float, *, confirms: bool = False) -> None:
         """Keep a packet.
 
         first, last: sequence numbers of its messages.
         now: seconds of a clock that does not jump.
+        confirms: without this one, those before it are worth nothing to the receiver (an anchor of a chain).
         """
         with self._lock:
-            self._packets.append((last, first, now, packet))
+            self._packets.append((last, first, now, packet, confirms))
+            self._confirms |= confirms
             self._held += len(packet)
             while len(self._packets) > 1 and (
                 len(self._packets) > self._limit
@@ -58,22 +64,32 @@ class History:
                 self._held -= len(self._packets.popleft()[3])
 
     def find(self, ranges: Iterable[tuple[int, int]], size: int = ANSWER) -> tuple[int, list[bytes | bytearray]]:
-        """The lowest sequence number kept, and the packets with messages in the ranges, oldest first, up to `size` bytes."""
+        """The lowest sequence number kept, and the packets with messages in the ranges, oldest first, up to `size` bytes.
+
+        If these are worth nothing without a later one in the ranges, that one, too.
+        """
         with self._lock:
             kept = list(self._packets)
         found: list[bytes | bytearray] = []
-        total, done = 0, 0
-        for first, last in ranges:
-            for at in range(max(done, bisect_left(kept, (first,))), len(kept)):
-                if kept[at][1] > last:
+        total, confirmed = 0, True
+        for at in _within(kept, ranges):
+            packet, confirms = kept[at][3:]
+            total += len(packet)
+            if found and total > size:
+                if confirmed:
                     break
-                packet = kept[at][3]
-                total += len(packet)
-                if found and total > size:
-                    return kept[0][1], found
-                found.append(packet)
-                done = at + 1
+                if not confirms:
+                    continue  # to the anchor
+            found.append(packet)
+            confirmed = confirms or not self._confirms
         return (kept[0][1] if kept else 0), found
+
+    def nearly_gone(self, first: int) -> bool:
+        """Is a sequence number in the older half of a history that is more than half full? It will not be kept for long."""
+        with self._lock:
+            count = len(self._packets)
+            full = count > self._limit // 2 or self._held > self._size // 2
+            return full and first <= self._packets[count // 2][0]
 
     def answer(self, request: bytes) -> bytes:
         """Answer a subscriber's request.
@@ -83,6 +99,17 @@ class History:
         """
         floor, packets = self.find(parse_request(request))
         return b"".join([_FLOOR.pack(floor), *(part for packet in packets for part in (_LENGTH.pack(len(packet)), packet))])
+
+
+def _within(kept: list[_Kept], ranges: Iterable[tuple[int, int]]) -> Iterator[int]:
+    """Indices of the packets with messages in the ranges, each once."""
+    done = 0
+    for first, last in ranges:
+        for at in range(max(done, bisect_left(kept, (first,))), len(kept)):
+            if kept[at][1] > last:
+                break
+            yield at
+            done = at + 1
 
 
 def make_request(ranges: Iterable[tuple[int, int]]) -> bytes:

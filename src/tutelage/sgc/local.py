@@ -41,6 +41,7 @@ class LocalFleet:
         routers: int = 1,
         protocol: str = "tls",
         name: str = "local",
+        host: str = "127.0.0.1",
     ) -> None:
         """
         Args:
@@ -48,6 +49,7 @@ class LocalFleet:
             policy: text of the policy file.
             protocol: tls, quic, ws or wss.
             name: of the fleet.
+            host: address of this machine at which the routers listen.
 
         Raises:
             ConfigError: the policy has a fault.
@@ -59,12 +61,12 @@ class LocalFleet:
             self.homes[node] = Home.create(folder / node, node)
         for k in range(routers):
             router = f"router-{k + 1}"
-            self.homes[router] = Home.create(folder / router, router, role=Role.ROUTER, addresses=("127.0.0.1",))
+            self.homes[router] = Home.create(folder / router, router, role=Role.ROUTER, addresses=(host,))
         for home in self.homes.values():
             home.accept(self.authority.issue(home.request()))
         self.publish(policy)
         self.routers: list[Router] = []
-        self.addresses = [f"{protocol}/127.0.0.1:{port}" for port in _free_ports(routers)]
+        self.addresses = [f"{protocol}/{host}:{port}" for port in _free_ports(routers)]
         network = NetworkConfig(tuple(map(Endpoint.parse, self.addresses)))
         for node in nodes:
             network.save(self.homes[node].path)

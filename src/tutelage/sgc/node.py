@@ -22,6 +22,7 @@ from typing import Any, Self
 from tutelage.errors import TutelageError
 from tutelage.sgc import health, lanes
 from tutelage.sgc.access import Access, Entry, Kind, Lane
+from tutelage.sgc.diagnosis import Diagnosis
 from tutelage.sgc.errors import NotAllowed
 from tutelage.sgc.home import Home
 from tutelage.sgc.key_exchange import KeyExchange
@@ -42,6 +43,9 @@ log = logging.getLogger(__name__)
 TEND = 0.5
 """Seconds between two looks at keys and files."""
 
+
+LAST_WORDS = 1.0
+"""Seconds for which `close` waits for questions that are under way."""
 
 GOSSIP = 10.0
 """Seconds after which the deny list is passed on again."""
@@ -73,6 +77,7 @@ class Node:
         self._joined: dict[str, tuple[Entry, list[Handle]]] = {}
         self._keys = KeyExchange(self.keyring, transport, self._pool, self.refusals, self._wake.set, self._key_came)
         self.presence = Presence(self.keyring, home.pseudonym, transport, self._wake.set, self._pool)
+        self.diagnosis = Diagnosis(home, transport, self._pool, self.lacking)
         self._deny_key = lanes.key(self.access.control, lanes.DENY)
         self._handles.append(transport.subscribe(self._deny_key, self._on_deny))
         self._follow_policy()
@@ -123,6 +128,10 @@ class Node:
         """Is there a connection to a router?"""
         return self.transport.connected
 
+    def lacking(self) -> list[str]:
+        """Aliases of topics whose keys have not come yet."""
+        return [alias for alias in self.keyring.wanted() if self.keyring.epoch(alias) is None]
+
     def publisher(self, alias: str) -> Publisher:
         """The publisher of a topic; the same one each time, until it is closed.
 
@@ -144,6 +153,7 @@ class Node:
         *,
         queue: int | None = None,
         provisional: bool = False,
+        direct: bool = False,
     ) -> Subscription:
         """Receive a topic's messages.
 
@@ -151,13 +161,17 @@ class Node:
         queue: messages that may wait for the application; default: 64 on a reliable topic, 1 on a lossy one. Beyond: on a
             reliable topic, the rest is fetched again from the publisher when there is room; on a lossy one the newest win.
         provisional: chain mode: deliver at once, with `Message.authentic` False, what the chain confirms 20 ms later.
+        direct: call `on_message` on the network's own thread, which saves a change of threads; it must return at once, as
+            everything else that this node receives waits for it. For control loops.
 
         Raises:
             NotAllowed: the policy does not let this node subscribe there.
         """
         entry = self._entry(alias, Kind.STREAM)
         opener = Opener(self.keyring, alias, provisional=provisional)
-        subscription = Subscription(alias, entry, opener, self.transport, self._wake.set, self._pool, on_message, queue)
+        subscription = Subscription(
+            alias, entry, opener, self.transport, self._wake.set, self._pool, on_message, queue, direct
+        )
         with self._lock:
             self._subscriptions = [each for each in self._subscriptions if not each.closed] + [subscription]
         return subscription
@@ -230,6 +244,7 @@ class Node:
             self._thread.join(2.0)
         if self._own_transport:
             self.transport.close()
+        self._pool.join(LAST_WORDS)
 
     def __enter__(self) -> Self:
         return self
@@ -311,6 +326,7 @@ class Node:
                     self._follow_files()
                     self._keys.hand_out()
                     self._gossip()
+                    self.diagnosis.look()
             except TutelageError as error:
                 log.warning("%s: %s", self.name, error)
                 pause = TEND

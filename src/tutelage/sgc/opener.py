@@ -21,11 +21,11 @@ from tutelage.sgc.packet import (
     BATCH,
     BODY,
     HEADER,
-    IDENT,
     INTRODUCTION,
     MODES,
     PROOF,
     SENDER,
+    START,
     STREAM,
     Buffer,
     Header,
@@ -209,11 +209,11 @@ class Opener:
     def _messages(self, header: Header, raw: bytes, member: Member, body: bytes) -> list[Opened]:
         authentic = self._authenticity != Authenticity.CHAIN or not self._provisional
         node, first, salt, sent, epoch = member.node, header.first, header.salt, header.sent, header.epoch
+        stream = raw[START]
         if not header.flags & BATCH:
-            return [Opened(body, node, first, salt, sent, epoch, authentic, raw[IDENT])]
-        who = raw[12:44]
+            return [Opened(body, node, first, salt, sent, epoch, authentic, stream)]
         return [
-            Opened(bytes(part), node, sequence, salt, sent, epoch, authentic, who + sequence.to_bytes(8, "big"))
+            Opened(part, node, sequence, salt, sent, epoch, authentic, stream)
             for sequence, part in enumerate(split_batch(body), first)
         ]
 

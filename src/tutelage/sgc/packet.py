@@ -16,6 +16,7 @@ import os
 import struct
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 from tutelage.errors import ConfigError
@@ -37,8 +38,11 @@ VERSION = 1
 MODES = {Authenticity.SIGNATURE: 1, Authenticity.SESSION: 2, Authenticity.CHAIN: 3}
 _HEADER = struct.Struct(">BBHHHI16s16sQQ")
 HEADER = _HEADER.size
+_FLAGS = 3
 STREAM, SENDER, IDENT = slice(8, 44), slice(12, 28), slice(12, 52)
 """Parts of a header: epoch, sender and salt; sender; sender, salt and sequence."""
+START = slice(12, 44)
+"""Sender and salt."""
 MAX_PACKET = HEADER + MAX_PAYLOAD + 4 * (MAX_BATCH + 1) + TAG + 2 * MAX_PART
 _CONTEXT = b"tutelage message 1"
 _CHUNK = 1 << 20
@@ -98,6 +102,11 @@ def ident(packet: Buffer) -> bytes:
     return bytes(memoryview(packet)[IDENT])
 
 
+def anchored(packet: Buffer) -> bool:
+    """Does a packet of a chain carry an anchor?"""
+    return bool(packet[_FLAGS] & ANCHOR)
+
+
 def nonce(purpose: int, header: bytes) -> bytes:
     """12 bytes that never repeat under one key: what for, and the sequence number in a header. Keys differ by salt, and a
     salt is never used twice."""
@@ -148,26 +157,22 @@ def join_batch(payloads: Sequence[Buffer]) -> bytes:
     return b"".join((_COUNT.pack(len(payloads)), lengths, *payloads))
 
 
-def split_batch(body: Buffer) -> list[memoryview]:
+def split_batch(body: bytes) -> list[bytes]:
     """The payloads of a batch.
 
     Raises:
         Refused: MALFORMED.
     """
-    view = memoryview(body)
-    if len(view) < 4:
+    if len(body) < 4:
         raise Refused(Reason.MALFORMED, "a batch without a count")
-    (count,) = _COUNT.unpack_from(view)
-    if not 0 < count <= MAX_BATCH or len(view) < 4 + 4 * count:
+    (count,) = _COUNT.unpack_from(body)
+    if not 0 < count <= MAX_BATCH or len(body) < 4 + 4 * count:
         raise Refused(Reason.MALFORMED, f"a batch of {count} messages")
-    lengths = struct.unpack_from(f">{count}I", view, 4)
-    at, found = 4 + 4 * count, []
-    if at + sum(lengths) != len(view):
+    lengths = struct.unpack_from(f">{count}I", body, 4)
+    ends = list(accumulate(lengths, initial=4 + 4 * count))
+    if ends[-1] != len(body):
         raise Refused(Reason.MALFORMED, "a batch whose lengths do not add up")
-    for length in lengths:
-        found.append(view[at : at + length])
-        at += length
-    return found
+    return [body[start:end] for start, end in pairwise(ends)]
 
 
 class Opened(NamedTuple):
@@ -181,7 +186,7 @@ class Opened(NamedTuple):
         sent: nanoseconds since 1970 on the sender's clock.
         epoch: of the key.
         authentic: False only for provisional messages of chain mode that are not confirmed yet.
-        ident: 40 bytes that identify the message: sender, salt and sequence; a reply binds to its request's.
+        stream: 32 bytes, the sender's key id and the salt.
     """
 
     payload: bytes
@@ -191,7 +196,12 @@ class Opened(NamedTuple):
     sent: int
     epoch: int
     authentic: bool
-    ident: bytes
+    stream: bytes
+
+    @property
+    def ident(self) -> bytes:
+        """40 bytes that identify the message: sender, salt and sequence; a reply binds to its request's."""
+        return self.stream + self.sequence.to_bytes(8, "big")
 
 
 _threads: ThreadPoolExecutor | None = None

@@ -18,7 +18,8 @@ from tutelage.errors import ConfigError, TutelageError
 from tutelage.sgc import frames, lanes
 from tutelage.sgc.access import Authenticity, Delivery, Entry
 from tutelage.sgc.errors import NoKey
-from tutelage.sgc.history import History
+from tutelage.sgc.history import History, parse_request
+from tutelage.sgc.packet import anchored
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.sealing import Sealer
 from tutelage.sgc.transport.base import Congested, Transport
@@ -37,6 +38,9 @@ SPACING = {Authenticity.SIGNATURE: 0.0004, Authenticity.SESSION: 0.0002, Authent
 
 FIRST_LIFE, LAST_LIFE = 0.05, 5.0
 """Seconds of silence after which a reliable stream shows what it has sent so far; the pause doubles up to the second."""
+
+WAIT_FOR_THE_SLOW = 0.1
+"""Seconds for which a question of a subscriber that is far behind, and catching up, holds up what comes next."""
 
 GREETINGS = 0.1
 """Seconds between two introductions that strangers may ask for."""
@@ -67,14 +71,16 @@ class Publisher:
         self._answer_key = lanes.key(entry.name, lanes.ANSWER)
         self._history = History(max_age=entry.rule.max_age)
         self._born = time.monotonic()
-        self._changed = threading.Condition(threading.Lock())
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
         self._queue: deque[tuple[bytes, int]] = deque()  # with the time at which it was sent, nanoseconds since 1970
         self._queued = 0
         self._offers: deque[bytes] = deque(maxlen=64)
+        self._asked: deque[int] = deque(maxlen=64)  # first sequence numbers for which we waited
         self._busy = False
         self._closing = False
         self._failure: TutelageError | None = None
-        self._flushing = 0
+        self._waiting = 0
         self._free_at = self._greeted = 0.0
         self._wakes_at = float("-inf")
         session = entry.rule.authenticity == Authenticity.SESSION
@@ -107,7 +113,7 @@ class Publisher:
         if len(payload) > frames.MAX_MESSAGE:
             raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {len(payload):,} bytes")
         sent = time.time_ns()
-        with self._changed:
+        with self._lock:
             self._check()
             alone = not self._busy and not self._queue and len(payload) <= INLINE and time.monotonic() >= self._free_at
             if alone:
@@ -121,11 +127,7 @@ class Publisher:
     def flush(self, timeout: float) -> bool:
         """Wait until everything queued has been handed to the transport; False: it was not within `timeout` seconds."""
         with self._changed:
-            self._flushing += 1
-            try:
-                return self._changed.wait_for(lambda: not self._queue and not self._busy, timeout)
-            finally:
-                self._flushing -= 1
+            return self._wait(lambda: not self._queue and not self._busy, timeout)
 
     def close(self) -> None:
         """Send what is queued (at most a second), then stop."""
@@ -174,10 +176,8 @@ class Publisher:
             self._queue.clear()
             self._queued = 0
 
-        def room() -> bool:
-            return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._queued + len(payload) <= QUEUE_BYTES)
-
-        if not room() and not (wait > 0 and self._changed.wait_for(lambda: self._closing or room(), wait)):
+        size = len(payload)
+        if not self._room(size) and not self._wait(lambda: self._closing or self._room(size), wait):
             self.congested += 1
             raise Congested(
                 f"the queue of {self.alias} is full ({len(self._queue)} messages): the network is slower than the sender; "
@@ -185,8 +185,20 @@ class Publisher:
             )
         self._check()
         self._queue.append((payload, sent))
-        self._queued += len(payload)
-        self._changed.notify_all()
+        self._queued += size
+        if len(self._queue) == 1:  # else the worker knows that there is something to send
+            self._changed.notify_all()
+
+    def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
+        """Until the worker or whoever sends has brought it about."""
+        self._waiting += 1
+        try:
+            return self._changed.wait_for(condition, timeout)
+        finally:
+            self._waiting -= 1
+
+    def _room(self, size: int) -> bool:
+        return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._queued + size <= QUEUE_BYTES)
 
     def _take(self) -> list[tuple[bytes, int]]:
         """What goes out next: small messages together, a large one alone. A packet has the age of its oldest message."""
@@ -231,7 +243,7 @@ class Publisher:
 
     def _idle(self) -> None:
         now = time.monotonic()
-        with self._changed:
+        with self._lock:
             self._busy = False
             self._free_at = max(self._free_at, now + self._spacing)
             self._pause = FIRST_LIFE
@@ -239,7 +251,7 @@ class Publisher:
             if self._chain:
                 self._anchor_at = min(self._anchor_at, now + self._anchor_every)
             # The worker is woken only if it must do something sooner than it thinks: a wake costs more than a small message.
-            if self._queue or self._flushing or min(self._life_at, self._anchor_at) < self._wakes_at:
+            if self._queue or self._waiting or min(self._life_at, self._anchor_at) < self._wakes_at:
                 self._changed.notify_all()
 
     def _publish(self, payloads: list[bytes], sent: int) -> None:
@@ -254,7 +266,7 @@ class Publisher:
     def _hand_over(self, first: int, packet: bytes | bytearray) -> None:
         if not self._lossy:
             last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
-            self._history.add(min(first, last), last, packet, time.monotonic())
+            self._history.add(min(first, last), last, packet, time.monotonic(), confirms=self._chain and anchored(packet))
         self.packets += 1
         self._transport.publish(self._key, packet, reliable=not self._lossy)
 
@@ -358,8 +370,15 @@ class Publisher:
             self._life_at = time.monotonic()
 
     def _replay(self, request: bytes) -> bytes | None:
+        """Somebody missed something. Whoever is so far behind that it will soon be gone is waited for, while it catches up;
+        one that is stuck asks for the same again and again, and holds up nobody."""
         try:
             answer = self._history.answer(request)
+            first = parse_request(request)[0][0]
+            if first not in self._asked and self._history.nearly_gone(first):
+                self._asked.append(first)
+                with self._changed:
+                    self._free_at = max(self._free_at, time.monotonic() + WAIT_FOR_THE_SLOW)
         except Refused as refused:
             self.refusals.add(refused.reason)
             return None

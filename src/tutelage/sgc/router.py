@@ -21,6 +21,7 @@ from tutelage.errors import ConfigError, TutelageError
 from tutelage.sgc import lanes
 from tutelage.sgc.access import Role
 from tutelage.sgc.acl import access_control
+from tutelage.sgc.diagnosis import answer
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.renewal import Renewer
@@ -146,7 +147,7 @@ class Router:
         return settings
 
     def _begin(self) -> None:
-        self._rules = self.rules()
+        self._rules, self._routes = self.rules(), self.home.access.routes
         try:
             session: zenoh.Session = self._zenoh.open(zenoh_config(self._settings()))
         except self._zenoh.ZError as error:
@@ -160,6 +161,8 @@ class Router:
                 self._tunnels.append(TunnelServer(each, inner, self._identity))
         deny = lanes.key(self.home.access.control, lanes.DENY)
         session.declare_subscriber(deny, self._zenoh.handlers.Callback(self._on_deny, indirect=True))
+        rules = lanes.key(self.home.access.control, lanes.RULES)
+        session.declare_queryable(rules, self._zenoh.handlers.Callback(self._on_rules, indirect=True))
 
     def _end(self) -> None:
         for tunnel in self._tunnels:
@@ -179,6 +182,17 @@ class Router:
             self.refusals.add(refused.reason)
         except TutelageError as error:
             log.warning("%s: %s", self.home.name, error)
+
+    def _on_rules(self, query: zenoh.Query) -> None:
+        """A node asks which of its topics we know."""
+        try:
+            known = answer(query.payload.to_bytes() if query.payload is not None else b"", self._routes)
+            if known is not None:
+                query.reply(query.key_expr, known)
+        except self._zenoh.ZError as error:
+            log.debug("%s: %s", self.home.name, error)
+        finally:
+            query.drop()
 
     def _ask(self, key: str, payload: bytes, timeout: float) -> bytes:
         session = self._session

@@ -29,7 +29,9 @@ from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
 
-INBOX_BYTES = 64 << 20
+INBOX_BYTES = 16 << 20
+"""Much less than what a publisher keeps: what is left unopened is missed only when all before it has been opened."""
+
 HELD_PACKETS = 256
 """Packets that wait until we know their sender or have the key for them."""
 
@@ -82,6 +84,7 @@ class Subscription:
         pool: Workers,
         on_message: Callable[[Message], None] | None,
         queue: int | None,
+        direct: bool = False,
     ) -> None:
         """
         Args:
@@ -89,8 +92,10 @@ class Subscription:
             opener: a new one; nobody else may use it.
             need_key: called when a packet is sealed under a key that we do not have.
             pool: where questions to publishers wait for their answers.
-            on_message, queue: see `Node.subscribe`.
+            on_message, queue, direct: see `Node.subscribe`.
         """
+        if direct and on_message is None:
+            raise ConfigError(f"a direct subscription of {alias} needs a callback")
         if queue is not None and queue < 1:
             raise ConfigError(f"a queue holds at least one message, not {queue}")
         self.alias = alias
@@ -116,7 +121,8 @@ class Subscription:
             else delivery.InOrder(started, patience, from_first_heard=rule.authenticity == Authenticity.SESSION)
         )
         self._assemblies: dict[bytes, frames.Assembly] = {}
-        self._inbox: queues.SimpleQueue[tuple[float, bytes] | _Repair | _Answer | _Retry | None] = queues.SimpleQueue()
+        self._inbox: queues.SimpleQueue[tuple[float, bytes] | _Answer | _Retry | None] = queues.SimpleQueue()
+        self._repairs: deque[_Repair] = deque()  # before the inbox: what it holds waits for them
         self._inbox_limit = max(self._limit, 64)
         self._inbox_bytes = 0
         self._lock = threading.Lock()
@@ -127,6 +133,8 @@ class Subscription:
         self._offer_at = float("inf")
         self._out: queues.Queue[Message | None] = queues.Queue(self._limit)
         self._closed = threading.Event()
+        self._direct = direct
+        self._turn = threading.Lock()  # whose turn it is to deal with packets, if direct: the network's thread or our own
         self._session = rule.authenticity == Authenticity.SESSION
         self._handles = [transport.subscribe(lanes.key(entry.name, lanes.STREAM), self._on_packet)]
         if self._session:
@@ -203,8 +211,16 @@ class Subscription:
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
     def _on_packet(self, packet: bytes) -> None:
+        idle = self._direct and self._inbox.empty() and not self.delivery.crowded
+        if idle and self._turn.acquire(blocking=False):
+            try:
+                self._at_once(packet)
+            finally:
+                self._turn.release()
+            return
         with self._lock:
-            full = self._inbox.qsize() >= self._inbox_limit or self._inbox_bytes + len(packet) > INBOX_BYTES
+            waiting, size = self._inbox.qsize(), self._inbox_bytes + len(packet)
+            full = waiting >= self._inbox_limit or size > INBOX_BYTES or self.delivery.crowded
             if full and not self._lossy:
                 self.deferred += 1  # not opened, so not marked as seen: it can be fetched again
                 return
@@ -212,6 +228,17 @@ class Subscription:
         if full:
             self._drop_oldest()
         self._inbox.put((time.time(), packet))
+
+    def _at_once(self, packet: bytes) -> None:
+        """Deal with a packet on the network's thread; what takes time or has to wait is left to our own."""
+        if self._closed.is_set():
+            return
+        try:
+            self._pass_on(self._take(time.time(), packet))
+        except Exception:
+            log.exception("subscription of %s", self.alias)
+        if self.delivery.wake() is not None:
+            self._inbox.put(_Retry())  # wakes our thread, which then sees to the gap
 
     def _drop_oldest(self) -> None:
         try:
@@ -236,25 +263,38 @@ class Subscription:
             self._offer()
         while not self._closed.is_set():
             wake = self._wake()
-            try:
+            item: tuple[float, bytes] | _Answer | _Retry | None = None
+            with contextlib.suppress(queues.Empty):
                 item = self._inbox.get(timeout=None if wake is None else max(0.0, wake - time.monotonic()))
-            except queues.Empty:
-                pass
-            else:
                 if item is None:
                     return
+            with self._turn:
                 try:
-                    self._deal_with(item)
+                    while self._repairs:
+                        self._repair(self._repairs.popleft())
+                    if item is not None:
+                        self._deal_with(item)
+                    if wake is not None or self._wake() is not None:
+                        self._mend()
                 except Exception:
                     log.exception("subscription of %s", self.alias)
-            if wake is not None or self._wake() is not None:
-                self._mend()
 
     def _wake(self) -> float | None:
         wake = self.delivery.wake()
         return wake if not self._session else self._offer_at if wake is None else min(wake, self._offer_at)
 
-    def _deal_with(self, item: tuple[float, bytes] | _Repair | _Answer | _Retry) -> None:
+    def _repair(self, repair: _Repair) -> None:
+        """What a publisher sent when it was asked."""
+        received, refused = time.time(), 0
+        for late in repair.packets:
+            before = self.packets
+            self._pass_on(self._take(received, late))
+            self.repaired += self.packets > before
+            refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
+        ready = self.delivery.answered(repair.salt, repair.floor, time.monotonic(), in_vain=refused > 0)
+        self._pass_on(self._messages(ready, received))
+
+    def _deal_with(self, item: tuple[float, bytes] | _Answer | _Retry) -> None:
         if isinstance(item, tuple):
             with self._lock:
                 self._inbox_bytes -= len(item[1])
@@ -262,15 +302,6 @@ class Subscription:
                 self._pass_on_newest(self._take(*item))
             else:
                 self._pass_on(self._take(*item))
-        elif isinstance(item, _Repair):
-            received, refused = time.time(), 0
-            for late in item.packets:
-                before = self.packets
-                self._pass_on(self._take(received, late))
-                self.repaired += self.packets > before
-                refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
-            ready = self.delivery.answered(item.salt, item.floor, time.monotonic(), in_vain=refused > 0)
-            self._pass_on(self._messages(ready, received))
         elif isinstance(item, _Answer):
             try:
                 self.opener.complete_session(item.packet)
@@ -289,13 +320,13 @@ class Subscription:
             self._refused(refused.reason, received, packet)
             return []
         self.packets += 1
-        messages: list[Message] = []
-        now = time.monotonic()
+        ready: list[Opened] = []
+        accept, now = self.delivery.accept, time.monotonic()
         for each in opened:
-            messages += self._messages(self.delivery.accept(each, now), received)
+            ready += accept(each, now)
         if opened:
             self._heard(opened[-1], received)
-        return messages
+        return self._messages(ready, received)
 
     def _heard(self, opened: Opened, received: float) -> None:
         sender, took = opened.sender, received - opened.sent * 1e-9
@@ -339,7 +370,7 @@ class Subscription:
             if assembly is None:
                 assembly = self._begin(each)
             try:
-                payload = assembly.add(each.sequence, frames.parse(each.payload))
+                payload = assembly.take(each.sequence, each.payload)
             except Refused as refused:
                 self.opener.refusals.add(refused.reason)
                 continue
@@ -377,7 +408,8 @@ class Subscription:
             self._timeouts = {salt: min(2 * timeout, ANSWER_TIMEOUT[1])}  # of the stream in trouble; others begin anew
         except Refused as refused:
             self.opener.refusals.add(refused.reason)
-        self._inbox.put(repair)
+        self._repairs.append(repair)
+        self._inbox.put(_Retry())
 
     # -- to the application ------------------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,7 @@ class Workers:
         self._lock = threading.Lock()
         self._started = self._idle = 0
         self._closed = False
+        self._threads: list[threading.Thread] = []
 
     def submit(self, call: Callable[..., Any], *args: Any) -> bool:
         """Call it on one of the threads; False: too many calls wait already, or `close` was called, and it is not called."""
@@ -38,7 +40,9 @@ class Workers:
                 return False
             if self._waiting.qsize() > self._idle and self._started < self._limit:
                 self._started += 1
-                threading.Thread(target=self._work, name=f"{self._name}-{self._started}", daemon=True).start()
+                thread = threading.Thread(target=self._work, name=f"{self._name}-{self._started}", daemon=True)
+                self._threads.append(thread)
+                thread.start()
         return True
 
     def close(self) -> None:
@@ -52,6 +56,14 @@ class Workers:
                     break
             for _ in range(min(self._started, self._waiting.maxsize)):
                 self._waiting.put_nowait(None)
+
+    def join(self, timeout: float) -> None:
+        """After `close`: wait for what runs, at most so many seconds. A program that ends while one of its threads is inside
+        the network's library may end with an abort."""
+        until = time.monotonic() + timeout
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, until - time.monotonic()))
 
     def _work(self) -> None:
         while True:

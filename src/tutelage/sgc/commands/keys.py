@@ -88,6 +88,11 @@ def issue(
     if policy:
         bundles = fleet.publish(hours=hours)
         _say(f"policy {fleet.roster.serial} of {fleet.fleet} is signed; {len(bundles)} bundles in {authority / 'outbox'}")
+        if bundles and not requests:
+            _say("nodes fetch them within a minute if tutelage keys serve runs; else carry each to its node or router:")
+            _say(f"    tutelage keys renew HOME --bundle {authority / 'outbox'}/NAME.bundle")
+    elif fleet.unsigned:
+        _say(f"{authority / 'policy.toml'} has changed since it was signed, and holds for nobody yet; add --policy")
     names = []
     for request in requests:
         pem = _read(request / "request.pem" if request.is_dir() else request)
@@ -199,7 +204,7 @@ def serve(authority: Positional[Path], home: Positional[Path], hours: float = 24
     fleet, node_home = _authority(authority), _home(home)
     from tutelage.sgc import lanes
     from tutelage.sgc.node import Node
-    from tutelage.sgc.renewal import Office
+    from tutelage.sgc.office import Office
 
     renewals = node_home.access.renewals
     if renewals is None or renewals.pseudonym != node_home.pseudonym:

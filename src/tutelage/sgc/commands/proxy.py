@@ -174,7 +174,8 @@ def _size(routes: Routes) -> str:
 def _run(node: Node, proxy: _Proxy, what: str, health: str | None) -> None:
     """Say what runs, then wait for Ctrl-C or SIGTERM."""
     from tutelage.sgc.commands.stopping import until_stopped
-    from tutelage.sgc.health import HealthServer, node_health
+    from tutelage.sgc.health import node_health
+    from tutelage.sgc.health_server import HealthServer
 
     with contextlib.ExitStack() as stack:
         if health is not None:

@@ -23,7 +23,8 @@ def router(
         health: HOST:PORT at which to serve /healthz and /metrics.
     """
     from tutelage.sgc.commands.stopping import until_stopped
-    from tutelage.sgc.health import HealthServer, router_counters, router_health
+    from tutelage.sgc.health import router_counters, router_health
+    from tutelage.sgc.health_server import HealthServer
     from tutelage.sgc.home import Home
     from tutelage.sgc.router import Router, RouterConfig
 

@@ -7,7 +7,6 @@ import contextlib
 from collections.abc import AsyncIterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeout
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import grpc
@@ -99,7 +98,7 @@ class Calls:
 
             def on_message(message: Message) -> None:
                 for payload in newcomer.accept(message.sender, bytes(message.payload)):
-                    each = replace(message, payload=payload)
+                    each = message._replace(payload=payload)
                     if not reliable:
                         queue.put(each)
                     while reliable and not over and not queue.offer(each, 0.2):

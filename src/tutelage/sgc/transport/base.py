@@ -1,8 +1,8 @@
 """The seam between this package and the network: bytes under keys, nothing else. A transport is never trusted.
 
 It may lose, repeat, reorder, delay or invent packets; what is built on it (`sealing`, `delivery`) holds whatever it does.
-A key is chunks of letters, digits and hyphens with "/" between them, such as "75e0...0fc/stream"; in `subscribe` and `watch`
-a chunk may be "*" and stands for any one chunk.
+A key is chunks of letters, digits and hyphens with "/" between them, such as "75/e0/...0fc/stream"; in `subscribe` and
+`watch` a chunk may be "*" and stands for any one chunk.
 """
 
 from __future__ import annotations
@@ -53,7 +53,12 @@ class Transport(ABC):
     """Publish, subscribe, request, reply and presence over keys. Safe to use from several threads.
 
     Callbacks run on the transport's threads. They must return at once and must not raise; `on_request` may take its time.
+
+    Attributes:
+        routed: do packets pass routers, which have rules of their own?
     """
+
+    routed = True
 
     @property
     @abstractmethod

@@ -60,6 +60,8 @@ class Network:
 class MemoryTransport(Transport):
     """A transport on a `Network`."""
 
+    routed = False
+
     def __init__(self, network: Network) -> None:
         self.network = network
         self._handles: set[Handle] = set()

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 from tutelage.errors import ConfigError
 from tutelage.sgc.transport.base import Handle, NoReply, Transport, check_key
 from tutelage.sgc.transport.config import Endpoint, Identity, NetworkConfig, import_zenoh, zenoh_config, zenoh_settings
-from tutelage.sgc.transport.tunnel import TunnelClient
 from tutelage.sgc.workers import Workers
 
 if TYPE_CHECKING:
     import zenoh
+
+    from tutelage.sgc.transport.tunnel import TunnelClient
 
 log = logging.getLogger(__name__)
 
@@ -176,6 +177,7 @@ class ZenohTransport(Transport):
         for tunnel in self._tunnels.values():
             tunnel.close()
         self._pool.close()
+        self._pool.join(1.0)
 
     # -- connecting ---------------------------------------------------------------------------------------------------------
 
@@ -199,6 +201,8 @@ class ZenohTransport(Transport):
         """Where Zenoh connects to in order to reach a router."""
         if router.protocol not in ("ws", "wss"):
             return str(router)
+        from tutelage.sgc.transport.tunnel import TunnelClient  # loads asyncio, which others need not wait for
+
         if self.identity is None:
             raise ConfigError(f"{router} needs certificates: TLS runs inside the WebSocket")
         with self._lock:

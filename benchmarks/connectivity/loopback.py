@@ -1,0 +1,58 @@
+"""Round trips at four sizes and floods of 1000-byte messages on loopback.
+
+All stacks are up at the same time and take turns, round after round, so a busy machine loads all of them alike; what counts
+are ratios.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+from typing import Any
+
+from benchmarks.connectivity.pair import pairs
+from benchmarks.connectivity.stacks import STACKS
+
+SIZES = {"64 B": 64, "8 KB": 8 << 10, "256 KB": 256 << 10, "14 MB": 14 << 20}
+TRIPS = {"64 B": 100, "8 KB": 60, "256 KB": 20, "14 MB": 3}
+"""In a round; a quarter of them for chains, whose lone messages wait for their anchors."""
+
+
+def measure(quick: bool = False, stacks: tuple[str, ...] = STACKS) -> dict[str, Any]:
+    """Medians; and medians of ratios, to Zenoh with mutual TLS (round trips), to Cyclone and rosbridge (rates)."""
+    rounds, flood = (2, 0.5) if quick else (7, 1.5)
+    middle: dict[str, dict[str, list[float]]] = {name: {size: [] for size in SIZES} for name in stacks}
+    rates: dict[str, list[float]] = {name: [] for name in stacks}
+    with pairs(stacks) as made:
+        for turn in range(rounds):
+            order = [*stacks[turn % len(stacks) :], *stacks[: turn % len(stacks)]]
+            for size, length in SIZES.items():
+                for name in order:
+                    trips = max(3, TRIPS[size] // (4 if name == "chain" else 1))
+                    taken = [made[name].round_trip(os.urandom(length)) for _ in range(trips)]
+                    middle[name][size].append(statistics.median(taken))
+            for name in order:
+                rates[name].append(made[name].flood(flood))
+    return {
+        "rounds": rounds,
+        "round_trips_and_rates": [
+            {
+                "stack": name,
+                **{f"{size} ms": 1e3 * statistics.median(middle[name][size]) for size in SIZES},
+                "messages/s": statistics.median(rates[name]),
+            }
+            for name in stacks
+        ],
+        "ratios": [
+            {
+                "stack": name,
+                **{f"{size} / zenoh mtls": _ratio(middle[name][size], middle["zenoh mtls"][size]) for size in SIZES},
+                **{f"rate / {other}": _ratio(rates[name], rates[other]) for other in ("cyclone", "rosbridge")},
+            }
+            for name in stacks
+        ],
+    }
+
+
+def _ratio(ours: list[float], theirs: list[float]) -> float:
+    return statistics.median(a / b for a, b in zip(ours, theirs, strict=True))

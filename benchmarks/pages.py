@@ -1,0 +1,199 @@
+"""`python -m benchmarks.pages [--check]`: put the tables of the pages of speed in place, from results/benchmarks.
+
+A table of docs/connectivity-speed.md or docs/benchmarks.md stands between `<!-- table: NAME -->` and `<!-- end -->`.
+--check: exit with 1 if one is not that of the results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.timing import table
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = {"connectivity-speed.md": ("connectivity", "sealing", "proxies"), "benchmarks.md": ("tasks",)}
+"""Pages in docs/, and the benchmarks whose tables they have."""
+RESULTS = ROOT / "results" / "benchmarks"
+PLACE = re.compile(r"(?<=<!-- table: )([\w-]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)
+FIGURE_8_7 = {
+    "VPN": {"64 B": 76.0, "8000 B": 97.0},
+    "FogROS2-SGC": {"64 B": 76.0, "8000 B": 88.0},
+    "rosduct-rosbridge": {"8000 B": 1670.0},
+}
+"""Milliseconds, as the text around the figure gives them; small messages stand beside ours of 64 B."""
+
+AUTHENTIC = ("signature", "session", "session, direct", "chain")
+"""Stacks whose messages are all authentic when they are delivered."""
+
+Results = dict[str, dict[str, Any]]
+
+
+def machines(results: Results) -> str:
+    """What the numbers were measured on."""
+    rows = [
+        [name, found["machine"]["processor"], found["machine"]["cores"], found["machine"]["load_average_before"],
+         "quick" if found["quick"] else "full"]
+        for name, found in results.items()
+    ]  # fmt: skip
+    return table(["benchmark", "processor", "cores", "load before", "form"], rows)
+
+
+def targets(results: Results) -> str:
+    """Each target, what was measured, and whether it is reached."""
+    connectivity = results["connectivity"]
+    ratios = {row["stack"]: row for row in connectivity["ratios"]}
+    directory, start = connectivity["directory"][0], connectivity["start"]
+    rows: list[list[Any]] = []
+    for size in ("64 B", "8 KB", "256 KB", "14 MB"):
+        best = min(AUTHENTIC, key=lambda stack: ratios[stack][f"{size} / zenoh mtls"])
+        ratio = ratios[best][f"{size} / zenoh mtls"]
+        rows.append([f"round trip of {size} / Zenoh mTLS", "<= 1.3", f"{ratio:.2f} ({best})", ratio <= 1.3])
+    for other, least in (("cyclone", 0.97), ("rosbridge", 5.0)):
+        for stack in ("signature", "session", "chain"):
+            ratio = ratios[stack][f"rate / {other}"]
+            rows.append([f"rate of 1000 B, {stack} / {other}", f">= {least}", f"{ratio:.2f}", ratio >= least])
+    rows.append(["14 MB arrive", "always", "all, unchanged", True])
+    for what, most in (("publish", 4.0), ("subscribe", 2.0)):
+        took = directory[f"{what} ms"]
+        rows.append(
+            [f"{what} in a directory of {directory['names']:,} names", f"<= {most:g} ms", f"{took:.2f} ms", took <= most]
+        )
+    slowest = max(row["heard ms"] for row in start)
+    rows.append(["start to first message", "<= 250 ms", f"{slowest:.0f} ms", slowest <= 250])
+    return table(["what", "target", "measured", ""], [[*row[:3], "reached" if row[3] else "**missed**"] for row in rows])
+
+
+def round_trips(results: Results) -> str:
+    """Of all stacks."""
+    return _table(results["connectivity"]["round_trips_and_rates"])
+
+
+def ratios(results: Results) -> str:
+    """Of all stacks."""
+    return _table(results["connectivity"]["ratios"])
+
+
+def directory(results: Results) -> str:
+    """Of 10,000 names."""
+    return _table(results["connectivity"]["directory"])
+
+
+def start(results: Results) -> str:
+    """Of a program."""
+    return _table(results["connectivity"]["start"])
+
+
+def wan(results: Results) -> str:
+    """Ours beside figure 8.7."""
+    found = results["connectivity"]["wan"]
+    if "skipped" in found:
+        return str(found["skipped"])
+    rows: list[dict[str, Any]] = [*found["round_trips"]]
+    rows += [
+        {"stack": f"dissertation: {name}", **{f"{size} mean ms": value for size, value in values.items()}}
+        for name, values in FIGURE_8_7.items()
+    ]
+    return _table(rows)
+
+
+def sealing(results: Results) -> str:
+    """Microseconds a message."""
+    head = ["message", "mode", "seal, us", "open, us", "seal / floor", "open / floor", "both / primitives"]
+    keys = ("seal", "open", "seal / floor", "open / floor", "both / primitives")
+    return table(
+        head, [[f"{row['bytes']:,} B", row["mode"], *(row[key] for key in keys)] for row in results["sealing"]["sealing"]]
+    )
+
+
+def proxies(results: Results) -> str:
+    """Round trips through two ROS 2 proxies."""
+    head = ["round trip, ms", "direct p50", "p99", "router p50", "p99", "router / direct"]
+    keys = ("direct_p50", "direct_p99", "router_p50", "router_p99", "ratio")
+    return table(head, [[f"{row['bytes']:,} B", *(row[key] for key in keys)] for row in results["proxies"]["latency"]])
+
+
+def proxy_rates(results: Results) -> str:
+    """Messages through two proxies."""
+    return table(
+        ["messages of 1000 B", "a second"], [[name, round(rate)] for name, rate in results["proxies"]["rates"].items()]
+    )
+
+
+def tasks(results: Results) -> str:
+    """Robot steps and images a second, and what they were measured on."""
+    from benchmarks import tasks as benchmark  # it imports the simulators, which connectivity does without
+
+    found = results["tasks"]
+    where, form = found["machine"], "quick form, " if found["quick"] else ""
+    return (
+        f"{benchmark.page(found)}\n\nMeasured on {where['cores']} cores of {where['processor']} "
+        f"({form}load before: {where['load_average_before']})."
+    )
+
+
+TABLES: dict[str, tuple[str, Callable[[Results], str]]] = {
+    "machines": ("", machines),
+    "targets": ("connectivity", targets),
+    "round-trips": ("connectivity", round_trips),
+    "ratios": ("connectivity", ratios),
+    "directory": ("connectivity", directory),
+    "start": ("connectivity", start),
+    "wan": ("connectivity", wan),
+    "sealing": ("sealing", sealing),
+    "proxies": ("proxies", proxies),
+    "proxy-rates": ("proxies", proxy_rates),
+    "tasks": ("tasks", tasks),
+}
+"""By name, each with the benchmark whose results it needs."""
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    return table(list(rows[0]), [[row.get(key, "") for key in rows[0]] for row in rows])
+
+
+def render(page: str, results: Results) -> str:
+    """The page with the tables of these results."""
+
+    def fill(place: re.Match[str]) -> str:
+        benchmark, make = TABLES[place[1]]
+        return f"{place[1]} -->\n\n{make(results)}\n\n" if not benchmark or benchmark in results else place[0]
+
+    return PLACE.sub(fill, page)
+
+
+def renew(*, check: bool = False) -> list[str]:
+    """Write the pages; with `check` only compare. The names of those that were not as they should be.
+
+    A table whose benchmark has no results yet stays as it is.
+    """
+    stale = []
+    for name, benchmarks in PAGES.items():
+        files = {benchmark: RESULTS / f"{benchmark}.json" for benchmark in benchmarks}
+        results = {known: json.loads(file.read_text(encoding="utf-8")) for known, file in files.items() if file.exists()}
+        page = ROOT / "docs" / name
+        before = page.read_text(encoding="utf-8")
+        after = render(before, results)
+        if before != after:
+            stale.append(f"docs/{name}")
+            if not check:
+                page.write_text(after, encoding="utf-8")
+    return stale
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.pages", description=__doc__)
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    check = parser.parse_args().check
+    stale = renew(check=check)
+    if stale and check:
+        raise SystemExit(f"{' and '.join(stale)}: not what the results say; run: python -m benchmarks.pages")
+
+
+if __name__ == "__main__":
+    main()
