@@ -1,7 +1,7 @@
-"""`python -m benchmarks.pages [--check]`: put the tables of docs/connectivity-speed.md in place, from results/benchmarks.
+"""`python -m benchmarks.pages [--check]`: put the tables of the pages of speed in place, from results/benchmarks.
 
-A table of the page stands between `<!-- table: NAME -->` and `<!-- end -->`. --check: exit with 1 if one is not
-that of the results.
+A table of docs/connectivity-speed.md or docs/benchmarks.md stands between `<!-- table: NAME -->` and `<!-- end -->`.
+--check: exit with 1 if one is not that of the results.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import Any
 from benchmarks.timing import table
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "connectivity-speed.md"
+PAGES = {"connectivity-speed.md": ("connectivity", "sealing", "proxies"), "benchmarks.md": ("tasks",)}
+"""Pages in docs/, and the benchmarks whose tables they have."""
 RESULTS = ROOT / "results" / "benchmarks"
 PLACE = re.compile(r"(?<=<!-- table: )([\w-]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)
 FIGURE_8_7 = {
@@ -123,6 +124,18 @@ def proxy_rates(results: Results) -> str:
     )
 
 
+def tasks(results: Results) -> str:
+    """Robot steps and images a second, and what they were measured on."""
+    from benchmarks import tasks as benchmark  # it imports the simulators, which connectivity does without
+
+    found = results["tasks"]
+    where, form = found["machine"], "quick form, " if found["quick"] else ""
+    return (
+        f"{benchmark.page(found)}\n\nMeasured on {where['cores']} cores of {where['processor']} "
+        f"({form}load before: {where['load_average_before']})."
+    )
+
+
 TABLES: dict[str, tuple[str, Callable[[Results], str]]] = {
     "machines": ("", machines),
     "targets": ("connectivity", targets),
@@ -134,6 +147,7 @@ TABLES: dict[str, tuple[str, Callable[[Results], str]]] = {
     "sealing": ("sealing", sealing),
     "proxies": ("proxies", proxies),
     "proxy-rates": ("proxies", proxy_rates),
+    "tasks": ("tasks", tasks),
 }
 """By name, each with the benchmark whose results it needs."""
 
@@ -152,18 +166,23 @@ def render(page: str, results: Results) -> str:
     return PLACE.sub(fill, page)
 
 
-def renew(*, check: bool = False) -> bool:
-    """Write the page; with `check` only compare. Was it as it should be?
+def renew(*, check: bool = False) -> list[str]:
+    """Write the pages; with `check` only compare. The names of those that were not as they should be.
 
     A table whose benchmark has no results yet stays as it is.
     """
-    files = {name: RESULTS / f"{name}.json" for name in ("connectivity", "sealing", "proxies")}
-    results = {name: json.loads(file.read_text(encoding="utf-8")) for name, file in files.items() if file.exists()}
-    before = PAGE.read_text(encoding="utf-8")
-    after = render(before, results)
-    if not check:
-        PAGE.write_text(after, encoding="utf-8")
-    return before == after
+    stale = []
+    for name, benchmarks in PAGES.items():
+        files = {benchmark: RESULTS / f"{benchmark}.json" for benchmark in benchmarks}
+        results = {known: json.loads(file.read_text(encoding="utf-8")) for known, file in files.items() if file.exists()}
+        page = ROOT / "docs" / name
+        before = page.read_text(encoding="utf-8")
+        after = render(before, results)
+        if before != after:
+            stale.append(f"docs/{name}")
+            if not check:
+                page.write_text(after, encoding="utf-8")
+    return stale
 
 
 def main() -> None:
@@ -171,8 +190,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.pages", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args().check
-    if not renew(check=check) and check:
-        raise SystemExit(f"{PAGE.relative_to(ROOT)} is not what the results say; run: python -m benchmarks.pages")
+    stale = renew(check=check)
+    if stale and check:
+        raise SystemExit(f"{' and '.join(stale)}: not what the results say; run: python -m benchmarks.pages")
 
 
 if __name__ == "__main__":

@@ -136,8 +136,12 @@ def reproduce(
             "table-8.3",
             "gates",
             "figure-5.3",
+            "figure-5.5",
             "figure-5.5-remote",
             "figure-C.1",
+            "figure-C.2",
+            "figure-C.3",
+            "figure-C.4",
         ]
     ],
     tasks: tuple[str, ...] = (),
@@ -154,10 +158,12 @@ def reproduce(
             (ThriftyDAgger and its rivals on peg insertion), table-3.2 (three robots, a person and a game, with simulated
             people), table-3.3 (on cable routing from images), table-8.3 (a fleet step over the network), gates (all of
             them with 100 robots and 10 humans), figure-5.3 (Fleet-DAgger's comparison, with table C.2),
-            figure-5.5-remote (block pushing with scripted operators at consoles), figure-C.1 (the ablations of C.U.R.).
+            figure-5.5 (block pushing with 4 robots and 2 humans, programs here), figure-5.5-remote (the same with scripted
+            operators at consoles), figure-C.1 (the ablations of C.U.R.), figure-C.2, figure-C.3, figure-C.4 (C.U.R. with
+            other M, t_T, t_R).
         tasks: which tasks; default: those of the figure.
         seeds: root seeds; default: 0 to 4 for figure-2.3, table-3.1 and gates (table-3.3: with --full), 0 to 9 for
-            table-3.2, 0 for figure-A.1, else 0 to 2.
+            table-3.2, 0 for figure-A.1 and, without --full, figures C.2 to C.4, else 0 to 2.
         full: the published scale; default: one that takes less than an hour on 4 cores.
         workers: runs side by side, one core each.
         out: folder of the run folders.

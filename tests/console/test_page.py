@@ -272,6 +272,18 @@ def test_a_gamepad_drives(browser: Any, served: Served) -> None:
         ana.page.wait_for_selector(".stage-mine", state="detached")
 
 
+def test_the_large_picture_may_come_by_webrtc(browser: Any, served: Served) -> None:
+    pytest.importorskip("aiortc")
+    with person(browser, served.origin, "vic") as vic:
+        vic.go("/robot/1")
+        vic.see(".way")
+        vic.page.locator("input[name=way]").last.check(force=True)
+        until(lambda: vic.page.evaluate("document.querySelector('.view video')?.videoWidth ?? 0") > 100, "a picture")
+        vic.see(".hud", "Last picture")
+        vic.page.locator("input[name=way]").first.check(force=True)
+        until(lambda: vic.page.evaluate("document.querySelector('.view canvas')?.width ?? 0") > 100, "a picture")
+
+
 def test_viewers_look_and_do_nothing(browser: Any, served: Served) -> None:
     with person(browser, served.origin, "vic") as vic:
         vic.go("/robot/0")

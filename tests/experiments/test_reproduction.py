@@ -12,7 +12,8 @@ import pytest
 from small import Here, walker
 
 from tutelage.errors import ConfigError
-from tutelage.experiments import figure_2_3, gates_table, jobs, reproduction, table_3
+from tutelage.experiments import figure_2_3, gates_table, jobs, reproduction, study, sweeps, table_3
+from tutelage.experiments.config import to_json
 from tutelage.experiments.figure_2_3 import ALGORITHMS, BC, LAZY, SAFE, Figure23Config, configuration
 from tutelage.learning.critic import CriticConfig
 
@@ -202,3 +203,85 @@ def test_every_gate_is_in_the_table_of_the_fleet(tmp_path: Path, monkeypatch: py
     rows = [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines()[4:]]
     assert rows == ["Behaviour cloning (C.)", "DAgger", "SafeDAgger", "EnsembleDAgger", "LazyDAgger",
                     "ThriftyDAgger (-Risk)", "HG-DAgger", "C.U.R."]  # fmt: skip
+
+
+# -- figures 5.3 and C.1 to C.4 -----------------------------------------------------------------------------------------------
+
+
+def test_figures_c_2_to_c_4_are_runs_that_differ_in_one_parameter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    small = walker(tmp_path / "unused")
+    ran: list[Any] = []
+
+    def one(config: Any, evaluate: int, expert: bool) -> dict[str, Any]:
+        ran.append(config)
+        m, fast = config.humans, 1 / (config.t_teleop + config.t_reset)
+        metrics = {
+            "successes": 100 * m * fast,
+            "hard_resets": 90.0 - m,
+            "idle_time": 90.0 / m,
+            "human_time": 1.0 * m,
+            "rohe": fast,
+        }
+        return {"algorithm": "C.U.R.", "seed": config.seed, "metrics": metrics, "config": to_json(config)}
+
+    monkeypatch.setattr(sweeps, "one", one)
+    monkeypatch.setattr(jobs, "ProcessPoolExecutor", Here)
+    where = (tmp_path / "runs", tmp_path / "results")
+    text = {what: reproduction.reproduce(what, (), (0, 1), False, 1, *where) for what in sweeps.SWEEPS}
+    assert {c.priority for c in ran} == {small.priority}
+    assert [c.humans for c in ran[:5]] == [1, 5, 10, 25, 50]
+    assert {(c.task, c.steps, c.robots) for c in ran} == {("Walker2d", 2000, 100)}
+    defaults = {c.folder for c in ran if (c.humans, c.t_teleop, c.t_reset) == (10, 5, 5)}
+    assert len(defaults) == 2, "one run for each seed serves all three figures"
+    assert "| 50 | 500.0 ± 0.0 | 40.0 ± 0.0 |" in text["figure-C.2"]
+    assert "cumulative successes increase with the number of humans: **HOLDS** (1: 10, 5: 50," in text["figure-C.2"]
+    assert "10 humans achieve the highest ROHE: **DOES NOT HOLD**" in text["figure-C.2"]
+    assert "a longer t_T than 5 has a lower ROHE: **HOLDS**" in text["figure-C.3"]
+    assert "hard resets decrease: **DOES NOT HOLD**" in text["figure-C.4"]
+    place = tmp_path / "results" / "single" / "figure-C.3"
+    assert sweeps.table("figure-C.3", jobs.read_results(place)) == text["figure-C.3"]
+
+
+def test_a_part_of_a_sweep_is_a_table_without_verdicts() -> None:
+    result = {
+        "seed": 0,
+        "metrics": {"successes": 3.0, "hard_resets": 2, "idle_time": 10, "human_time": 20, "rohe": 0.1},
+        "config": {"task": "Ant", "robots": 4, "steps": 50, "humans": 5},
+    }
+    text = sweeps.table("figure-C.2", [result])
+    assert "| 5 | 3.0 | 2.0 | 10.0 | 20.0 | 0.100 |" in text
+    assert "HOLD" not in text
+
+
+def test_a_sweep_asks_for_what_exists() -> None:
+    with pytest.raises(ConfigError, match="unknown task Walker; known tasks: HalfCheetah"):
+        sweeps.SweepConfig(tasks=("Walker",))
+
+
+def test_figure_5_3_is_long_enough_for_two_episodes_and_initial_periods(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    studies: list[Any] = []
+    monkeypatch.setattr(reproduction, "run_study", studies.append)
+    for full in (False, True):
+        reproduction.reproduce("figure-5.3", ("Walker2d", "Anymal", "AllegroHand"), (), full, 1, tmp_path, tmp_path)
+    assert [(s.task, s.steps, s.evaluate) for s in studies] == [
+        ("Walker2d", 2000, 1000), ("Anymal", 5000, 2500), ("AllegroHand", 5000, 1000),
+        ("Walker2d", 10_000, 10_000), ("Anymal", 10_000, 10_000), ("AllegroHand", 10_000, 10_000),
+    ]  # fmt: skip
+
+
+def test_figure_5_5_is_four_robots_that_push_blocks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    studies: list[Any] = []
+    monkeypatch.setattr(reproduction, "run_study", studies.append)
+    for full in (False, True):
+        reproduction.reproduce("figure-5.5", (), (), full, 1, tmp_path, tmp_path)
+    assert [(s.task, s.robots, s.humans, s.steps, s.t_teleop, s.seeds) for s in studies] == [
+        ("BlockPushing", 4, 2, 250, 3, (0, 1, 2))
+    ] * 2
+    assert [s.observation for s in studies] == ["state", "images"]
+    runs = study.configurations(studies[1], 100.0)
+    assert {"C. (BC)", "Random", "U.C."} < set(runs)
+    assert {(run.t_teleop, run.observation, run.learner.batch) for run in runs.values()} == {(3, "images", 64)}
+    with pytest.raises(ConfigError, match=r"figure-5\.5 is about BlockPushing; leave out --tasks"):
+        reproduction.reproduce("figure-5.5", ("Ant",), (), False, 1, tmp_path, tmp_path)

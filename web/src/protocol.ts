@@ -47,6 +47,8 @@ export interface Description {
   algorithm: string;
   controls: Controls;
   version?: string;
+  /** Whether the server can send pictures by WebRTC. */
+  webrtc?: boolean;
   /** Timesteps of a hard reset. */
   t_reset?: number;
   /** Seconds without command or heartbeat after which the robot holds, and after which the lease ends. */

@@ -6,6 +6,7 @@ keeps for longer than it takes to look at a few numbers. What happened is told b
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import sys
@@ -211,6 +212,8 @@ class Engine:
     def start(self) -> None:
         """Let the loop run."""
         sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH))
+        gc.collect()
+        gc.freeze()  # what there is by now stays: looking through all of it again and again would hold everybody up
         self.herald.start()
         if isinstance(self.learner, ProcessLearner):
             self.learner.start()

@@ -257,6 +257,13 @@ class Physics:
         )  # fmt: skip
         wait(futures)
 
+    def place(self, robots: Array, qpos: Array) -> None:
+        """Move the given robots (n indices) to qpos (n, nq) in the middle of what they do: all else goes on."""
+        for robot, row in zip(robots, qpos, strict=True):
+            self.datas[robot].qpos[:] = row
+        if "qpos" in self.frame:
+            self.frame["qpos"][robots] = qpos
+
     def _spread(self, kernel: Any, robots: Array, *arguments: Any) -> list[Future[None]]:
         robots = np.ascontiguousarray(robots, dtype=np.intp)
         # The threads claim robots one by one from a common counter, in compiled code: falls and contacts take longer, and

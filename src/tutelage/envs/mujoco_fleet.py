@@ -77,6 +77,12 @@ class MujocoFleet(TaskFleet):
         self._declare(low, high, self._observe().shape[1])
 
     def _restart(self, robots: Array) -> None:
+        if isinstance(self.task, GoalTask) and self.task.goes_on:
+            onward, robots = robots[self._complete[robots]], robots[~self._complete[robots]]
+            if onward.size:
+                self.physics.place(onward, self.task.onward(self._rng, self.physics.frame["qpos"][onward]))
+            if not robots.size:
+                return
         qpos, qvel = self.task.initial(self._rng, robots.size, self.physics.qpos0, self.physics.qvel0)
         self.physics.restart(robots, qpos, qvel)
         self._pusher.calm(robots)

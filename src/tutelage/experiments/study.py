@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -26,6 +26,7 @@ from tutelage.envs.tasks import TASKS
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.jobs import Job, resolved, run_jobs, slug, start_or_resume
+from tutelage.experiments.table_3 import SETTINGS
 from tutelage.fleet.allocation import NOBODY, FleetDAgger
 from tutelage.fleet.modes import Mode
 from tutelage.fleet.priority import PriorityConfig
@@ -47,6 +48,8 @@ class StudyConfig:
         steps: T.
         robots: N.
         humans: M.
+        t_teleop: t_T.
+        observation: what the policies see, "state" or "images"; the latter with the learner of table 3.3.
         evaluate: timesteps of the evaluation of the frozen policies; 0: none.
         ablations: run C.U.R. and its ablations (figure C.1) instead of the baselines.
         workers: runs side by side, one core each.
@@ -59,6 +62,8 @@ class StudyConfig:
     steps: int = 10_000
     robots: int = 100
     humans: int = 10
+    t_teleop: int = 5
+    observation: Literal["state", "images"] = "state"
     evaluate: int = 10_000
     ablations: bool = False
     workers: int = 4
@@ -104,9 +109,10 @@ def random_threshold(budget: float, steps: int, robots: int, humans: int, t_tele
 
 def configurations(study: StudyConfig, human_time: float | None) -> dict[str, RunConfig]:
     """The first seed's configuration of each algorithm; human_time: T_h of C.U.R., None while it is not known."""
+    learner = SETTINGS["table-3.3"].learner if study.observation == "images" else LearnerConfig()
     base = RunConfig(
         study.task, steps=study.steps, robots=study.robots, humans=study.humans, threads=1, torch_threads=1,
-        record="none", label="C.U.R.",
+        record="none", label="C.U.R.", t_teleop=study.t_teleop, observation=study.observation, learner=learner,
     )  # fmt: skip
     if human_time is None:
         return {"C.U.R.": base}
@@ -119,7 +125,7 @@ def configurations(study: StudyConfig, human_time: float | None) -> dict[str, Ru
             for name in ABLATIONS
         }  # fmt: skip
     threshold = random_threshold(human_time, study.steps, study.robots, study.humans, base.t_teleop, base.t_reset)
-    cloning = LearnerConfig(schedule="never", pretrain=base.learner.pretrain + study.steps)
+    cloning = with_(learner, schedule="never", pretrain=learner.pretrain + study.steps)
     return {
         BEHAVIOUR_CLONING: with_(
             base,
@@ -130,6 +136,8 @@ def configurations(study: StudyConfig, human_time: float | None) -> dict[str, Ru
         ),
         "Random": with_(base, priority="Random.", label="Random", thresholds=PriorityConfig(random=threshold)),
         "U.C.": with_(base, priority="U.C.", label="U.C."),
+        # Fleet-ThriftyDAgger needs a goal (section 5.6).
+        **({"U.G.C.": with_(base, priority="U.G.C.", label="U.G.C.")} if TASKS[study.task].goal else {}),
     }
 
 
@@ -179,7 +187,8 @@ def _jobs(study: StudyConfig, configs: dict[str, RunConfig], human_time: int = 0
     for seed in study.seeds:
         for name, config in configs.items():
             # C.U.R. is the same run in the comparison and among the ablations of equal length.
-            place = study.out / f"{study.task}-{study.robots}x{study.humans}-{study.steps}"
+            seen = "-images" if study.observation == "images" else ""
+            place = study.out / f"{study.task}{seen}-{study.robots}x{study.humans}-{study.steps}"
             budget = f"-{human_time}" if name in (BEHAVIOUR_CLONING, "Random") else ""
             config = dataclasses.replace(config, seed=seed, out=place / f"{slug(name)}{budget}-s{seed}")
             file = study.results / kind / study.task / f"{slug(name)}-s{seed}.json"

@@ -158,15 +158,15 @@ def _tiles(pictures: list[Picture], columns: int | None = None) -> Picture:
 
 
 def _write_sheet(config: WatchConfig, pictures: list[Picture]) -> None:
-    image = _pillow().fromarray(_tiles([_framed(p, False, False) for p in pictures], MOMENTS // 2))
+    image = pillow().fromarray(_tiles([_framed(p, False, False) for p in pictures], MOMENTS // 2))
     buffer = io.BytesIO()
     image.save(buffer, "png", optimize=True)
     write_atomic(config.path, buffer.getvalue())
 
 
 def _write_gif(path: Path, frames: Iterator[Picture], rate: int) -> None:
-    pillow = _pillow()
-    first, *rest = [pillow.fromarray(frame).quantize(64) for frame in frames]
+    draw = pillow()
+    first, *rest = [draw.fromarray(frame).quantize(64) for frame in frames]
     buffer = io.BytesIO()
     first.save(buffer, "gif", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
     write_atomic(path, buffer.getvalue())
@@ -190,7 +190,8 @@ def _write_mp4(path: Path, frames: Iterator[Picture], rate: int) -> None:
         raise TutelageError(f"ffmpeg could not write {path}: {reason[-1]}")
 
 
-def _pillow() -> Any:
+def pillow() -> Any:
+    """Pillow's `Image`, or a MissingExtraError."""
     try:
         from PIL import Image
     except ImportError:

@@ -11,6 +11,7 @@ import { LOOK_TEXT, Mode as ModeNumber, reasonText } from "../modes";
 import { confirmDialog } from "../parts/Dialog";
 import { askToClear } from "../parts/EStop";
 import { Mode } from "../parts/Glyph";
+import { PeerPicture } from "../parts/PeerPicture";
 import { Picture } from "../parts/Picture";
 import { Ribbon } from "../parts/Ribbon";
 import type { OperatorRow } from "../protocol";
@@ -19,6 +20,29 @@ import * as store from "../store";
 import { noStats, type ViewStats } from "../video";
 import { Controls, noGesture } from "./Controls";
 import { Tile, withWhom } from "./Wall";
+
+const way = signal<"jpeg" | "webrtc">("jpeg");
+const byPeer = (): boolean => way.value === "webrtc" && store.fleet.value?.webrtc === true;
+
+function noPeer(why: string): void {
+  way.value = "jpeg";
+  store.note(`No pictures by WebRTC: ${why}. JPEG goes on.`, "warning");
+}
+
+/** How the large picture comes, where the server has both ways. */
+function Way() {
+  if (!store.fleet.value?.webrtc) return null;
+  return (
+    <fieldset class="segments small way" aria-label="Pictures by">
+      {(["jpeg", "webrtc"] as const).map((value) => (
+        <label key={value}>
+          <input type="radio" name="way" checked={way.value === value} onChange={() => (way.value = value)} />
+          <span>{value === "jpeg" ? "JPEG" : "WebRTC"}</span>
+        </label>
+      ))}
+    </fieldset>
+  );
+}
 
 export function Stage({ index }: { index: number }) {
   const cell = store.robots.value[index];
@@ -64,6 +88,7 @@ function Known({ index }: { index: number }) {
             ))}
           </fieldset>
         ) : null}
+        <Way />
       </header>
       <div class="stage-body">
         <div class="stage-left">
@@ -130,7 +155,11 @@ export function View({ frame, index, camera, stats, mine }: { frame: { current: 
       aria-label={mine ? `Driving ${name}. ${store.fleet.value?.controls.help ?? ""}` : `Picture of ${name}`}
       {...listeners}
     >
-      <Picture robot={index} camera={camera} fps={20} priority={2} label={`Live picture of ${name}`} stats={stats} />
+      {byPeer() ? (
+        <PeerPicture robot={index} camera={camera} label={`Live picture of ${name}`} stats={stats} onFail={noPeer} />
+      ) : (
+        <Picture robot={index} camera={camera} fps={20} priority={2} label={`Live picture of ${name}`} stats={stats} />
+      )}
       {usable && drag ? <Arrow from={drag.from} to={drag.to} width={stats.value.width || 16} height={stats.value.height || 9} /> : null}
       {tooOld && old.value !== null ? <p class="view-note">Picture is {duration(old.value)} old</p> : null}
       {old.value === null ? <p class="view-note">Waiting for a picture…</p> : null}
@@ -177,7 +206,7 @@ function Hud({ stats, mine }: { stats: { value: ViewStats }; mine: boolean }) {
   const cells: [string, string, boolean][] = [
     ["Round trip", milliseconds(rtt === null ? null : rtt * 1000), rtt !== null && rtt > 0.25],
     ["Pictures", `${stats.value.fps.toFixed(0)} /s`, stats.value.fps < 2],
-    ["Picture age", picture === null ? "–" : milliseconds(picture * 1000), picture !== null && picture > 0.7],
+    [byPeer() ? "Last picture" : "Picture age", picture === null ? "–" : milliseconds(picture * 1000), picture !== null && picture > 0.7],
     ["State age", state === null ? "–" : milliseconds(state * 1000), state !== null && state > 0.7],
     ["Command p99", milliseconds(p99), p99 !== null && p99 > 100],
   ];

@@ -1,5 +1,6 @@
 """The built-in tasks."""
 
+from tutelage.envs.tasks.allegro_hand import AllegroHand
 from tutelage.envs.tasks.ant import Ant
 from tutelage.envs.tasks.anymal import Anymal
 from tutelage.envs.tasks.ball_balance import BallBalance
@@ -28,6 +29,7 @@ TASKS: dict[str, type[Task]] = {
         ObstaclePushing,
         BallBalance,
         FrankaCubeStack,
+        AllegroHand,
     )
 }
 MUJOCO: dict[str, type[MujocoTask]] = {name: task for name, task in TASKS.items() if issubclass(task, MujocoTask)}

@@ -172,10 +172,16 @@ class GoalTask(MujocoTask):
     """A task that is complete as soon as the robot reaches a goal state, where its episode ends."""
 
     goal = True
+    goes_on: ClassVar[bool] = False
+    """Whether a robot that reached its goal gets the next one where it is (`onward`), instead of an initial state."""
 
     @abstractmethod
     def success(self, frame: Frame) -> NDArray[np.bool_]:
         """Whether each robot is in the goal set, (N,)."""
+
+    def onward(self, rng: np.random.Generator, qpos: Array) -> Array:
+        """Of a task that goes on: qpos (n, nq) with new goals for robots that completed it in the states qpos (n, nq)."""
+        raise NotImplementedError
 
     def forward(self, frame: Frame, body_mass: Array) -> Array:
         """Nothing travels."""
