@@ -54,7 +54,8 @@ export function choose(
   const all = [...merged.values()].sort((a, b) => b.priority - a.priority || a.robot - b.robot || a.camera - b.camera);
   let chosen = all;
   if (all.length > most) {
-    const first = all.filter((stream) => stream.priority > 0).slice(0, most);
+    // A third of the places goes round among the others, so that nobody's picture never comes.
+    const first = all.filter((stream) => stream.priority > 0).slice(0, most - Math.ceil(most / 3));
     const rest = all.filter((stream) => !first.includes(stream));
     const places = most - first.length;
     const start = places ? (turn * places) % rest.length : 0;

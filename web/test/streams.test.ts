@@ -24,6 +24,12 @@ describe("what is watched", () => {
     }
     expect(seen.size).toBe(100);
   });
+  it("shows everybody now and then, even where all are important", () => {
+    const wishes = Array.from({ length: 60 }, (_, k) => wish(k, { priority: 1 }));
+    const seen = new Set<number>();
+    for (let turn = 0; turn < 4; turn += 1) choose(wishes, 1, turn).forEach((stream) => seen.add(stream.robot));
+    expect(seen.size).toBe(60);
+  });
   it("is as sharp as the screen and not sharper", () => {
     expect(sizeFor(150, 1)).toEqual([160, 90]);
     expect(sizeFor(240, 2)).toEqual([640, 360]);
