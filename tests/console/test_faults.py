@@ -162,10 +162,11 @@ class TestFullDisk:
                 server.of.command("ann", 1, lease.id, seq, [0.01])
                 server.steps(1)
             audit.full = True
-            server.of.command("ann", 1, lease.id, 6, [0.01])
+            with pytest.raises(Denied) as refused:
+                server.of.command("ann", 1, lease.id, 6, [0.01])
+            assert refused.value.code == "held"
             assert "disk full" in server.wait_told(Notice, level="error").text
             t, before = server.of.engine.loop.t, server.of.engine.loop.obs[:, 0].copy()
-            server.of.command("ann", 1, lease.id, 7, [0.5])
             time.sleep(0.4)
             assert server.of.engine.loop.t == t
             assert (server.of.engine.loop.obs[:, 0] == before).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from pathlib import Path
@@ -72,6 +73,22 @@ class TestDriving:
             before = position(server, 1)
             server.steps(3)
             assert position(server, 1) == before
+
+    def test_every_command_is_in_the_record(self, tmp_path: Path) -> None:
+        with Serving(config(tmp_path)) as server:
+            lease = server.take("ann", 1)
+            drive(server, lease, 0.25, 3)
+            drive(server, lease, 0.5, 2)  # too late
+            server.of.command("ann", 1, lease.id, 4, None, assist=True)
+            for seq in range(5, 9):
+                drive(server, lease, None, seq)
+            server.audit.flush()
+            rows = list(reversed(server.audit.rows(kind="command")))
+        said = [json.loads(row.fields) for row in rows]
+        assert [row["seq"] for row in said] == [3, 4, 5], "that nothing is pressed is said once"
+        assert said[0] == {"lease": lease.id, "seq": 3, "action": [0.25]}
+        assert said[1] == {"lease": lease.id, "seq": 4, "assist": True}
+        assert {(row.who, row.robot) for row in rows} == {("ann", 1)}
 
     def test_an_older_command_is_dropped(self, tmp_path: Path) -> None:
         with Serving(config(tmp_path)) as server:

@@ -62,7 +62,7 @@ class Engine:
 
     def __init__(self, config: EngineConfig, audit: Audit, report: Report = lambda what, done: None) -> None:
         self.config, self.audit, self.clock = config, audit, time.monotonic
-        self.lock = threading.Condition()
+        self.lock, self._stopping = threading.Condition(), threading.Lock()
         self.operators = Operators()
         self.herald = Herald(audit)
         self.rows: deque[dict[str, Any]] = deque(maxlen=7200)
@@ -132,7 +132,9 @@ class Engine:
         self.driver = Driver(
             controls_of(run.task, fleet.inner, config.assist and parts.expert is not None), fleet, parts.expert
         )
-        self.people = People(self.offers, self.driver, self.lock, self.clock, config.lockstep, self.operators.used)
+        self.people = People(
+            self.offers, self.driver, self.lock, self.clock, config.lockstep, self.operators.used, self._log
+        )
         self.reasons = Reasons(parse(run.priority, run.thresholds, run.gate), self.offers, run.queue == "fifo")
         self.desk = Desk(self.people, self.reasons, self.clock, run.t_reset, config.gated)
         self._version = self._known_version()
@@ -289,7 +291,8 @@ class Engine:
         """An emergency stop outlives the server."""
         self._log_quietly(kind, operator, robots[0] if len(robots) == 1 else None, robots=robots)
         try:
-            write_atomic(self._stops, json.dumps(np.flatnonzero(self.parts.fleet.stopped).tolist()).encode())
+            with self._stopping:  # the newest is written last, whoever comes first
+                write_atomic(self._stops, json.dumps(np.flatnonzero(self.parts.fleet.stopped).tolist()).encode())
         except TutelageError as error:
             self.trouble = str(error)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.console.controls import Driver
-from tutelage.console.offers import NOBODY, Offers
+from tutelage.console.offers import NOBODY, Log, Offers
 from tutelage.console.reasons import Reasons
 from tutelage.console.states import Denied, Lease
 from tutelage.fleet.allocation import FleetDAgger
@@ -61,10 +61,11 @@ class People(Team):
     Args:
         offers: who has which robot.
         driver: turns commands into actions.
-        lock: guards `offers` and the commands; notified when a command or an answer arrives.
+        lock: guards `offers` and the commands; notified when something arrives that is waited for.
         clock: s, never goes back.
         lockstep: whether each command is for one timestep and stays good until then.
         used: told (operator, seconds from a command's arrival to its first use).
+        log: writes commands down, see `Offers`; one that cannot be written down is not kept.
     """
 
     def __init__(
@@ -75,8 +76,10 @@ class People(Team):
         clock: Clock,
         lockstep: bool = False,
         used: Callable[[str, float], None] = lambda operator, seconds: None,
+        log: Log = lambda kind, who, robot, **fields: None,
     ) -> None:
         self.offers, self.driver, self.lock, self._clock = offers, driver, lock, clock
+        self._log = log
         self._once, self._lockstep, self._used = lockstep or driver.controls.once, lockstep, used
         self.latency = np.zeros(len(offers.seats), dtype=np.int64)
         self.distinct = []
@@ -102,6 +105,7 @@ class People(Team):
 
         Raises:
             Denied: stale_lease, not_yours or bad_command.
+            TutelageError: it cannot be recorded.
         """
         clean = self.driver.check(action)
         drag = self.driver.check_push(push)
@@ -116,10 +120,15 @@ class People(Team):
             if before and before.lease == lease and seq <= before.seq:
                 return False
             command = Command(seq, now, lease, clean, assist, drag)
+            if not (command.silent and before and before.silent):
+                said = {"action": clean, "assist": assist, "push": drag}
+                told = {name: value for name, value in said.items() if value is not None and value is not False}
+                self._log("command", operator, robot, lease=lease, seq=seq, **told)
             if not command.silent:
                 hold.commanded = now
             self.commands[robot] = command
-            self.lock.notify_all()
+            if self._lockstep:  # else nobody waits for it
+                self.lock.notify_all()
         return True
 
     # -- the loop's team ----------------------------------------------------------------------------------------

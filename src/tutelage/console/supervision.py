@@ -129,7 +129,12 @@ class Supervision:
         push: Sequence[float] | None = None,
     ) -> bool:
         """What the robot is to do. The newest command wins; False: it is older than one that came before, and dropped."""
-        return self.engine.people.give(operator, robot, lease, seq, action, assist, push)
+        try:
+            return self.engine.people.give(operator, robot, lease, seq, action, assist, push)
+        except Denied:
+            raise
+        except TutelageError as error:
+            raise Denied("held", f"nothing can be recorded, so nobody may drive: {error}") from None
 
     def renew(self, operator: str, lease: str) -> None:
         """The person is still there."""
