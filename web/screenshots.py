@@ -3,7 +3,7 @@
     python web/screenshots.py [--fleet sim:PegInsertion] [--robots 12] [--seconds 60] [--out web/shots]
 
 Starts `tutelage serve` in a temporary folder, lets two programs work as operators for a while, so that there is something to
-see, and takes over a robot itself. Needs Chromium and playwright.
+see, and takes over a robot itself. With --docs those of docs/console.md are renewed, too. Needs Chromium and playwright.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def shoot(browser: Any, origin: str, out: Path, size: str, scheme: str) -> None:
             page.wait_for_selector(".stage-mine", timeout=4000)
             page.locator(".view").focus()
             page.keyboard.down("ArrowRight")
-            page.wait_for_selector(".kbd-on, .stick-on", timeout=2000)
+            page.wait_for_selector(".view-live", timeout=3000)
             page.wait_for_selector(".offer", state="detached", timeout=2000)
             page.wait_for_timeout(400)
             driven = page.locator(".stage-mine .view-live").count()
@@ -135,12 +135,39 @@ def shoot(browser: Any, origin: str, out: Path, size: str, scheme: str) -> None:
     somebody.close()
 
 
+def for_docs(shots: Path) -> None:
+    """The pictures of docs/console.md, few colours and small."""
+    from PIL import Image
+
+    images = ROOT / "docs" / "images"
+
+    def load(name: str) -> Image.Image:
+        return Image.open(shots / f"{name}.png").convert("RGB")
+
+    def save(picture: Image.Image, name: str) -> None:
+        picture.quantize(160, dither=Image.Dither.NONE).save(images / f"console-{name}.png", optimize=True)
+
+    save(load("wall-desktop-light"), "wall")
+    save(load("drive-desktop-dark"), "drive")
+    save(load("charts-desktop-light").crop((0, 0, 1440, 620)), "charts")
+    phones = [load(f"{name}-phone-light") for name in ("queue", "wall", "drive")]
+    height, gap = 760, 24
+    phones = [
+        phone.resize((round(phone.width * height / phone.height), height), Image.Resampling.LANCZOS) for phone in phones
+    ]
+    row = Image.new("RGB", (sum(phone.width + gap for phone in phones) - gap, height), (180, 186, 177))
+    for k, phone in enumerate(phones):
+        row.paste(phone, (k * (phone.width + gap), 0))
+    save(row, "phone")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fleet", default="sim:PegInsertion")
     parser.add_argument("--robots", type=int, default=12)
     parser.add_argument("--seconds", type=float, default=60.0, help="of work before the first picture")
     parser.add_argument("--out", type=Path, default=ROOT / "web" / "shots")
+    parser.add_argument("--docs", action="store_true", help="renew docs/images/console-*.png")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, chromium() as browser, contextlib.ExitStack() as stack:
@@ -153,6 +180,8 @@ def main() -> None:
         for size in SIZES:
             for scheme in ("light", "dark"):
                 shoot(browser, server.origin, arguments.out, size, scheme)
+    if arguments.docs:
+        for_docs(arguments.out)
     print(f"{len(list(arguments.out.glob('*.png')))} pictures in {arguments.out}")
 
 

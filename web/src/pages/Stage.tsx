@@ -77,7 +77,7 @@ function Known({ index }: { index: number }) {
         </a>
         <h1>{robot.name}</h1>
         <Mode look={robot.look} note={withWhom(robot)} />
-        {robot.reason && robot.look !== "auto" && robot.reason !== robot.look ? <span class="stage-reason">{reasonText(robot.reason)}</span> : null}
+        {robot.reason && robot.look !== "auto" && robot.reason !== robot.look && !(robot.reason === "asked" && robot.operator) ? <span class="stage-reason">{reasonText(robot.reason)}</span> : null}
         {cameras.length > 1 ? (
           <fieldset class="segments small cameras" aria-label="Camera">
             {cameras.map((name, k) => (
