@@ -108,7 +108,7 @@ function Film({ episode }: { episode: Episode }) {
           ←
         </a>
         <h2>{robotName(episode.robot)}</h2>
-        <Mode look={lookOfMode(frame.mode)} note={episode.operator ? `${frame.mode === 1 || frame.mode === 3 ? "with" : "by"} ${episode.operator}` : undefined} />
+        <Mode look={lookOfMode(frame.mode)} note={episode.operator && frame.mode ? `${frame.mode === 1 || frame.mode === 3 ? "with" : "by"} ${episode.operator}` : undefined} />
         <span class={`outcome outcome-${episode.outcome}`}>{words(episode.outcome || "open")}</span>
       </header>
       <div class="view">
