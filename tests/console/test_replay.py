@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +80,19 @@ def test_films_are_there_after_the_server_started_again(tmp_path: Path) -> None:
         server.wait(lambda: len(server.of.episodes()) == 3, 5.0)
         assert len({row["id"] for row in server.of.episodes()}) == 3
         assert [row["robot"] for row in server.of.episodes(limit=1)] == [0]
+
+
+def test_a_film_that_was_being_made_when_the_server_was_killed(tmp_path: Path) -> None:
+    with Serving(pushing(tmp_path, hz=20.0)) as server:
+        intervene(server)
+    with closing(sqlite3.connect(tmp_path / "films.sqlite")) as films:
+        films.execute("UPDATE film SET outcome = NULL, seconds = NULL, frames = NULL")
+        films.commit()
+    with Serving(pushing(tmp_path, hz=20.0)) as server:
+        (row,) = server.of.episodes()
+        assert row["outcome"] == "lost"
+        assert row["frames"] > 10
+        assert row["seconds"] == pytest.approx(row["frames"] / 20.0)
 
 
 def test_no_films_where_nobody_wants_them(tmp_path: Path) -> None:

@@ -47,6 +47,11 @@ CREATE TABLE IF NOT EXISTS film (id INTEGER PRIMARY KEY, lease TEXT, robot INTEG
     seconds REAL, outcome TEXT, frames INTEGER);
 CREATE TABLE IF NOT EXISTS reel (film INTEGER, first INTEGER, frames INTEGER, content BLOB, PRIMARY KEY (film, first));
 """
+_KILLED = """
+UPDATE film SET outcome = 'lost', frames = (SELECT coalesce(sum(frames), 0) FROM reel WHERE reel.film = film.id),
+    seconds = ? * (SELECT coalesce(sum(frames), 0) FROM reel WHERE reel.film = film.id) WHERE outcome IS NULL
+"""
+"""What is known of a film that was being made when the server was killed."""
 
 
 @dataclass
@@ -89,7 +94,7 @@ class Replay:
         with closing(self._connect()) as database:
             database.executescript(_SCHEMA)
             self._next = 1 + (database.execute("SELECT max(id) FROM film").fetchone()[0] or 0)
-            database.execute("UPDATE film SET outcome = 'lost' WHERE outcome IS NULL")  # the server was killed
+            database.execute(_KILLED, (every / engine.config.hz,))
 
     def start(self) -> None:
         """Begin to write."""
