@@ -91,7 +91,7 @@ def test_a_film_that_was_being_made_when_the_server_was_killed(tmp_path: Path) -
     with Serving(pushing(tmp_path, hz=20.0)) as server:
         (row,) = server.of.episodes()
         assert row["outcome"] == "lost"
-        assert row["frames"] > 10
+        assert row["frames"] >= 5
         assert row["seconds"] == pytest.approx(row["frames"] / 20.0)
 
 
