@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from remote.field import Field
+from remote.field import Field, said
 
 from tutelage.remote.fleet import RemoteFleet
 
@@ -32,7 +32,8 @@ def fleet(field: Field) -> Iterator[RemoteFleet]:
             if made.step(go)[-1]["online"].all():
                 break
         else:
-            raise AssertionError(made.status())
+            told = [said(robot)[-500:] for robot in field.robots.values()]
+            raise AssertionError(made.status(), told, made.node.counters())
         yield made
     finally:
         made.close()
