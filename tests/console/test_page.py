@@ -254,6 +254,27 @@ def test_a_press_on_the_picture_drives(browser: Any, served: Served) -> None:
         ana.page.wait_for_selector(".stage-mine", state="detached")
 
 
+def test_nobody_drives_what_they_do_not_see(browser: Any, served: Served) -> None:
+    with person(browser, served.origin, "ana") as ana:
+        take(ana, 1)
+        ana.go("/charts")
+        ana.see(".charts")
+        ana.page.wait_for_timeout(300)
+        ana.page.keyboard.down("ArrowRight")
+        ana.page.wait_for_timeout(500)
+        with served.client("ben") as http:
+            before = commands(http)
+            ana.page.wait_for_timeout(500)
+            assert commands(http) == before
+        ana.page.keyboard.up("ArrowRight")
+        ana.page.keyboard.press("g")
+
+
+def commands(http: Any) -> int:
+    """Commands of ana's that were executed."""
+    return int(next(row["commands"] or 0 for row in http.get("/api/operators").json()["rows"] if row["operator"] == "ana"))
+
+
 PAD = """() => {
   const pad = { connected: true, id: "A pad (Vendor: 1)", axes: [0.9, 0, 0, 0], buttons: [] };
   navigator.getGamepads = () => [pad];

@@ -130,7 +130,7 @@ function tick(changed = false): void {
   const going = which.pointer?.kind === "go" && drag !== null;
   const assist = assisting();
   const switching = performance.now() - switchedAt < SWITCH;
-  const pressed = going || assist || switching || anythingPressed(which, state);
+  const pressed = watching() && (going || assist || switching || anythingPressed(which, state));
   if (pressed) {
     if (assist) command(null, true, null);
     else if (going && drag) command(null, false, [...drag.from, ...drag.to]);
@@ -140,6 +140,11 @@ function tick(changed = false): void {
   }
   wasPressed = pressed;
   sending.value = pressed;
+}
+
+/** Nobody drives a robot that is not in front of them: on other pages the keys move nothing, and the robot holds. */
+function watching(): boolean {
+  return document.querySelector(".stage-mine") !== null;
 }
 
 function typing(target: EventTarget | null): boolean {
@@ -154,7 +159,7 @@ function begin(): () => void {
   const blocked = (event: KeyboardEvent): boolean =>
     event.ctrlKey || event.metaKey || event.altKey || typing(event.target) || document.querySelector("dialog[open]") !== null;
   const down = (event: KeyboardEvent): void => {
-    if (!mine.has(event.code) || blocked(event)) return;
+    if (!mine.has(event.code) || blocked(event) || !watching()) return;
     // Space and Enter on a focused button still press the button; on the picture they drive.
     if ((event.code === "Space" || event.code === "Enter") && (event.target as HTMLElement).closest?.("button, a, summary")) return;
     event.preventDefault();

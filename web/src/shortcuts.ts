@@ -12,7 +12,6 @@ let lastEscape = -Infinity;
 
 function escape(event: KeyboardEvent): void {
   if (event.repeat || !store.canOperate.value) return;
-  if (document.querySelector("dialog[open], details.person[open], details.hand-over[open]")) return; // Esc closes those
   const at = performance.now();
   if (at - lastEscape < TWICE) {
     lastEscape = -Infinity;
@@ -20,6 +19,7 @@ function escape(event: KeyboardEvent): void {
     return;
   }
   lastEscape = at;
+  if (document.querySelector("dialog[open]")) return; // once closes it; twice still stops all
   const driven = store.lease.value?.robot;
   if (driven !== undefined) void emergencyStop(driven);
 }
