@@ -14,7 +14,7 @@ from floor import LeaseEnded, LeaseGranted, Serving, Stepped, config
 from tutelage.console.offers import Offers
 from tutelage.console.reasons import Reasons
 from tutelage.console.states import Denied, Offer
-from tutelage.fleet.gates import GateConfig
+from tutelage.fleet.gates import GATES, GateConfig
 from tutelage.fleet.modes import Mode
 from tutelage.fleet.priority import PriorityConfig, parse
 
@@ -77,6 +77,19 @@ class TestReasons:
         watch = Reasons(parse("C.", THRESHOLDS), offers)
         watch(make_view(violation=(True, False, True, True)))
         assert watch.order[0] == 2
+
+
+@pytest.mark.parametrize("priority", ["C.", "U.C.", "C.U.R.", "Random.", "U.G.C.", *GATES])
+def test_every_algorithm_can_be_served(priority: str, tmp_path: Path) -> None:
+    with Serving(
+        config(tmp_path, priority=priority, fleet="sim:small:goal_fleet", run={"expert": "small:Reaching"})
+    ) as server:
+        server.of.join("ann")
+        server.steps(10)
+        lease = server.take("ann", 1) if not server.now.leases else None
+        if lease is not None:
+            server.of.give_back("ann", 1)
+        assert server.of.healthy["ok"], server.of.healthy
 
 
 class TestGated:

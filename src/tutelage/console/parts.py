@@ -29,8 +29,8 @@ from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.store import load_tree, save_tree, write_atomic
 
 Report = Callable[[str, float], None]
-UNSURE, RISKY = 0.05, 0.5
-"""Thresholds of uncertainty and risk of a policy that was not trained before."""
+UNSURE, RISKY, DIFFERENT = 0.05, 0.5, 0.1
+"""Thresholds of uncertainty, risk and discrepancy for a policy that was not trained before."""
 SERVED = "serve.json"
 """The file of a folder that says what is supervised there."""
 
@@ -198,17 +198,20 @@ def _connect(config: EngineConfig) -> Fleet:
 def _bare(run: RunConfig, fleet: Fleet) -> Assembly:
     """Robots of which nothing is known but what they observe and what they can do."""
     shape = fleet.single_observation_space.shape or ()
-    thresholds, gate = run.thresholds, run.gate
-    if thresholds.uncertainty is None:  # no run of the cloned policy could say what is much
-        thresholds = dataclasses.replace(thresholds, uncertainty=UNSURE)
-    if thresholds.risk is None:
-        thresholds = dataclasses.replace(thresholds, risk=RISKY)
-    if thresholds.initial is None:
-        thresholds = dataclasses.replace(thresholds, initial=0)
+    # No run of a cloned policy could say what is much.
+    thresholds = _filled(run.thresholds, uncertainty=UNSURE, risk=RISKY, initial=0)
+    gate = _filled(
+        run.gate, beta_h=DIFFERENT, novelty=UNSURE, risk_ask=RISKY, risk_cede=RISKY / 2, mean_discrepancy=DIFFERENT / 2
+    )
     run = sized(dataclasses.replace(run, thresholds=thresholds, gate=gate), shape)
     learner = learner_of(run, shape, fleet.action_low, fleet.action_high)
     actor = experts.load(run.task)[0] if run.task in TASKS else learner.policy
     return Assembly(run, fleet, actor, learner.policy, learner)
+
+
+def _filled(settings: Any, **values: Any) -> Any:
+    """A configuration with these values where it has none."""
+    return dataclasses.replace(settings, **{name: v for name, v in values.items() if getattr(settings, name) is None})
 
 
 def _again(config: EngineConfig) -> Parts:
