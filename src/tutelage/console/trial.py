@@ -2,8 +2,8 @@
 
     python -m tutelage.console.trial '{"priority": "C.U.R.", "seed": 0}'
 
-A whole server on loopback, as `tutelage serve` starts it, and operators who log in, are offered robots, accept, drive and give
-back. Prints the result as one line of JSON. `tutelage reproduce figure-5.5-remote` runs many of these.
+A whole server on loopback, as `tutelage serve` starts it, and operators who log in, are offered robots, accept, drive and
+give back. Prints the result as one line of JSON. `tutelage reproduce figure-5.5-remote` runs many of these.
 """
 
 from __future__ import annotations
