@@ -19,6 +19,7 @@ from tutelage.console.audit import samples_in
 from tutelage.console.states import Denied
 from tutelage.console.supervision import EngineConfig
 from tutelage.fleet.modes import Mode
+from tutelage.learning.imitation import LearnerConfig
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def config(field: Field, out: Path, **changes: Any) -> EngineConfig:
 
 def all_there(server: Serving) -> None:
     server.wait(lambda: server.now.online.all(), 30.0, "robots are not in reach")
-    server.wait(lambda: (server.now.mode == Mode.AUTONOMOUS).all())
+    server.wait(lambda: (server.now.mode != Mode.OFFLINE).all())
 
 
 def test_a_person_drives_a_robot_over_the_network(field: Field, tmp_path: Path) -> None:
@@ -125,3 +126,27 @@ def test_the_server_starts_again_and_goes_on(field: Field, tmp_path: Path) -> No
         server.of.command("ann", 0, lease.id, 0, [0.0, 0.0])
         server.steps(2)
         assert np.isfinite(server.of.engine.loop.obs).all()
+
+
+def test_robots_at_a_known_task_begin_with_a_clone_of_its_expert_and_get_what_people_taught(tmp_path: Path) -> None:
+    run = {"offline_pairs": 200, "learner": LearnerConfig(pretrain=10, batch=16), "members": 2, "hidden": (8,)}
+    with Field(tmp_path / "maze", 1) as maze:
+        maze.router()
+        maze.robot(1, "--hz", 20, "--policy", env="Navigation", wait=False)
+        changes = {"policy": None, "learner": "process", "priority": "U.C.", "swap_every": 0.2, "run": run, "humans": 1}
+        with Serving(config(maze, tmp_path / "out", **changes)) as server:
+            assert server.of.description.task == "Navigation"
+            pointer = server.of.description.controls.pointer
+            assert pointer is not None
+            assert pointer.kind == "go"
+            all_there(server)
+            lease = server.take("ann", 0)
+            for seq in range(20):
+                server.of.command("ann", 0, lease.id, seq, None, assist=True)
+                server.steps(1)
+                server.of.jpeg(0, 0)
+            assert server.of.jpeg(0, 0) is not None
+            server.of.give_back("ann", 0)
+            server.wait(lambda: server.now.policy_version > 0, 40.0, "nothing was learned")
+            engine: Any = server.of.engine
+            server.wait(lambda: engine.parts.fleet.inner.proposals()[1][0] == engine._shared.version, 20.0, "no new weights")

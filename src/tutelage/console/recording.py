@@ -43,8 +43,9 @@ class Recording:
     def on_step(self, loop: Loop, step: Step) -> None:
         """Write, end, tell."""
         engine = self._engine
-        engine.tick = time.perf_counter() - engine.pace.began
-        self._dearest = max(self._dearest, time.thread_time() - engine.pace.worked)
+        worked = time.thread_time() - engine.pace.worked
+        engine.tick = worked if engine.parts.fleet.paces else time.perf_counter() - engine.pace.began
+        self._dearest = max(self._dearest, worked)
         self._samples(step)
         try:
             engine.recorder.on_step(loop, step)

@@ -110,7 +110,7 @@ class Snapshot:
             (seconds, or None)}.
         leases: by robot: {operator, id, since, held, reason}.
         policy_version: how often the policy's weights were replaced.
-        tick: seconds that the timestep took; late: how much too late it began, s.
+        tick: seconds that the timestep took, without the wait for real robots; late: how much too late it began, s.
     """
 
     t: int
