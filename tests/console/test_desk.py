@@ -87,6 +87,13 @@ class Floor(RuleBasedStateMachine):
         self.meanwhile.append((what, (name,) if what == "leave" else (name, robot)))
         self.meanwhile.append(("take", (other, robot)))
 
+    @rule(to=NAMES)
+    def robots_that_change_hands_as_their_reset_begins(self, to: str) -> None:
+        for robot, hold in list(self.offers.holds.items()):
+            self.ask_for("hand_over", hold.lease.operator, robot, to)
+            self.ask_for("reset", hold.lease.operator, robot)
+            self.meanwhile.append(("accept", (to, robot)))
+
     @rule(robot=ROBOTS)
     def everybody_wants_it(self, robot: int) -> None:
         for name in ("ann", "bob", "eve"):

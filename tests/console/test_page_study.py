@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from browsing import Person, chromium, person
 from consoles import Running
-from test_study import config
+from test_study_session import config
 
 from tutelage.console.audit import Audit
 from tutelage.console.study import Study
