@@ -289,7 +289,8 @@ def test_a_broken_record_is_told_with_its_row(tmp_path: Path) -> None:
 
 def test_a_server_that_is_interrupted_while_it_prepares_ends_at_once(tmp_path: Path) -> None:
     command = [sys.executable, "-c", MAIN, "serve", "--fleet", "sim:Navigation", "--port", "0", "--out", str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    heeds = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}  # a shell's background jobs ignore Ctrl-C
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **heeds) as process:
         assert process.stdout
         assert process.stdout.readline()  # what is being prepared
         process.send_signal(signal.SIGINT)
