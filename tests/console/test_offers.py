@@ -201,6 +201,18 @@ class TestHandOver:
         assert offers.robot_of()[b] == 1
         assert ended(offers) == [(1, "handed_over")]
 
+    def test_a_robot_in_its_hard_reset_does_not_change_hands(self) -> None:
+        offers = desk()
+        offers.join("ann", 0.0)
+        offers.join("bob", 0.0)
+        offers.take("ann", 1, 0.0)
+        offers.hand_over("ann", 1, "bob", 1.0)
+        offers.reset("ann", 1, 2.0)
+        for refused in (lambda: offers.accept("bob", 1, 3.0), lambda: offers.hand_over("ann", 1, "bob", 3.0)):
+            with pytest.raises(Denied) as denied:
+                refused()
+            assert denied.value.code == "taken"
+
     def test_a_declined_one_stays(self) -> None:
         offers = desk()
         offers.join("ann", 0.0)

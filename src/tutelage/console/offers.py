@@ -172,7 +172,7 @@ class Offers:
         if robot in self.holds and self.holds[robot].human == j:
             return self.holds[robot].lease
         passing = self.passing.get(robot)
-        if passing and passing.human == j and robot in self.holds and robot not in self.resetting:
+        if passing and passing.human == j and robot in self.holds and not self.holds[robot].reset:
             reason = self.holds[robot].lease.reason
             self._log("hand_over", operator, robot, giver=self.holds[robot].lease.operator)
             self._end(robot, "handed_over", now)
@@ -219,6 +219,8 @@ class Offers:
     def hand_over(self, operator: str, robot: int, to: str, now: float) -> None:
         """Offer one's robot to a certain person."""
         hold = self._held_by(operator, robot)
+        if hold.reset:
+            raise Denied("taken", "its hard reset is yours to the end")
         k = self._find(to)
         if k is None or not self._seat(k).present:
             raise Denied("unknown_person", f"{to} is not here")
