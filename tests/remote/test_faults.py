@@ -15,7 +15,8 @@ from sgc.fleets import eventually
 from tutelage.fleet.modes import Mode
 from tutelage.remote import topics
 from tutelage.remote.fleet import RemoteFleet
-from tutelage.remote.wire import Command, Order, pack_command
+from tutelage.remote.messages import Command, Order
+from tutelage.remote.wire import pack_command
 from tutelage.sgc.authority import Authority
 from tutelage.sgc.errors import NotAllowed
 from tutelage.sgc.home import Home

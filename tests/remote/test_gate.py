@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tutelage.remote.gate import CommandGate
-from tutelage.remote.wire import Command, Order, pack_command
+from tutelage.remote.messages import Command, Order
+from tutelage.remote.wire import pack_command
 
 BOOT, SERVER, WATCHDOG = 7, 70, 0.5
 

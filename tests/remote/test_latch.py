@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from tutelage.remote.latch import Latch
-from tutelage.remote.wire import Stop, StopOperation, pack_stop
+from tutelage.remote.messages import Stop, StopOperation
+from tutelage.remote.wire import pack_stop
 
 
 def message(number: int, operation: StopOperation = StopOperation.STOP, server: int = 5) -> bytes:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tutelage.remote.messages import Answer, Description, Flag, Observation, Picture
 from tutelage.remote.slot import Slot
-from tutelage.remote.wire import Answer, Description, Flag, Observation, Picture, pack_observation, pack_picture
+from tutelage.remote.wire import pack_observation, pack_picture
 
 FLEET = Description((2,), "float32", (-1.0,), (1.0,))
 SERVER, DEADLINE = 9, 0.5

@@ -23,7 +23,7 @@ PUBLISHED = {"SSH + SFTP": 0.86, "FogROS2-SGC": 0.31}
 NAMES = {
     "ssh_sftp_each": "SSH + SFTP, new connections at each step",
     "ssh_sftp_open": "SSH + SFTP, connections kept open",
-    "ours": "Tutelage: sealed, signed in, over a router (TLS)",
+    "ours": "Tutelage: end-to-end encryption, over a router (TLS)",
 }
 
 

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from tutelage.errors import TutelageError
 from tutelage.remote import jpeg
-from tutelage.remote.driver import Grab
-from tutelage.remote.wire import Picture, pack_picture
+from tutelage.remote.messages import Picture
+from tutelage.remote.simulated import Grab
+from tutelage.remote.wire import pack_picture
 from tutelage.sgc.publisher import Publisher
 
 log = logging.getLogger(__name__)

@@ -31,8 +31,7 @@ from tutelage.files import write_atomic
 from tutelage.fleet.fleet import Fleet, Mask
 from tutelage.remote import topics
 from tutelage.remote.jpeg import decode
-from tutelage.remote.slot import Slot
-from tutelage.remote.wire import (
+from tutelage.remote.messages import (
     Ask,
     Command,
     Description,
@@ -43,6 +42,9 @@ from tutelage.remote.wire import (
     Stop,
     StopOperation,
     Weights,
+)
+from tutelage.remote.slot import Slot
+from tutelage.remote.wire import (
     pack_ask,
     pack_command,
     pack_stop,

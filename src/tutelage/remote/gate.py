@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from tutelage.remote.wire import Command, Counts, Malformed, Order, unpack_command
+from tutelage.remote.messages import Command, Counts, Malformed, Order
+from tutelage.remote.wire import unpack_command
 
 SERVERS = 16
 """Starts of servers that are remembered."""

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.errors import MissingExtraError
-from tutelage.remote.wire import MAX_SIDE, Malformed, jpeg_size
+from tutelage.remote.messages import MAX_SIDE, Malformed
+from tutelage.remote.wire import jpeg_size
 
 Array = NDArray[Any]
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from tutelage.errors import TutelageError
 from tutelage.files import write_atomic
-from tutelage.remote.wire import Counts, Malformed, StopOperation, unpack_stop
+from tutelage.remote.messages import Counts, Malformed, StopOperation
+from tutelage.remote.wire import unpack_stop
 
 log = logging.getLogger(__name__)
 

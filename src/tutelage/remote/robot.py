@@ -29,20 +29,8 @@ from tutelage.remote.driver import Driver, describe, observation_of
 from tutelage.remote.eyes import Eyes
 from tutelage.remote.gate import CommandGate
 from tutelage.remote.latch import Latch
-from tutelage.remote.wire import (
-    Answer,
-    Ask,
-    Counts,
-    Flag,
-    Malformed,
-    Observation,
-    Operation,
-    Order,
-    pack_answer,
-    pack_description,
-    pack_observation,
-    unpack_ask,
-)
+from tutelage.remote.messages import Answer, Ask, Counts, Flag, Malformed, Observation, Operation, Order
+from tutelage.remote.wire import pack_answer, pack_description, pack_observation, unpack_ask
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
 

@@ -12,17 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.remote.wire import (
-    Answer,
-    Counts,
-    Description,
-    Flag,
-    Malformed,
-    Observation,
-    Picture,
-    unpack_observation,
-    unpack_picture,
-)
+from tutelage.remote.messages import Answer, Counts, Description, Flag, Malformed, Observation, Picture
+from tutelage.remote.wire import unpack_observation, unpack_picture
 
 Array = NDArray[Any]
 

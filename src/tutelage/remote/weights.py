@@ -32,7 +32,8 @@ from tutelage.fleet.step import Step
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.remote import topics
 from tutelage.remote.fleet import RemoteFleet
-from tutelage.remote.wire import Weights, pack_weights, unpack_weights
+from tutelage.remote.messages import Weights
+from tutelage.remote.wire import pack_weights, unpack_weights
 from tutelage.sgc.node import Node
 
 log = logging.getLogger(__name__)
