@@ -138,7 +138,7 @@ def test_a_closed_tab_leaves_a_robot_that_holds_and_asks_again(browser: Any, ser
         ben.see(".stage-head", "Driven by ana")
         time.sleep(1.0)
         ana.close()
-        ben.see(".stage-head", re.compile("Holding|Violated"), seconds=2.5)
+        ben.see(".stage-head", re.compile("Holding|Violated"), seconds=5)
         ben.page.wait_for_function(
             "() => !document.querySelector('.panel')?.textContent.includes('ana has this robot')", timeout=12_000
         )
