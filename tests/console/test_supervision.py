@@ -409,7 +409,8 @@ class TestCrowd:
                 time.sleep(0.01)
             for thread in threads:
                 thread.join()
-            assert server.of.healthy["ok"], server.of.healthy
+            assert server.of.healthy["error"] is None
+            assert server.of.healthy["ok"]
             assert server.now.t > t + 50
         granted = [event.lease.id for event in server.told(LeaseGranted)]
         ended = [event.lease for event in server.told(LeaseEnded)]
