@@ -159,6 +159,32 @@ def for_docs(shots: Path) -> None:
     for k, phone in enumerate(phones):
         row.paste(phone, (k * (phone.width + gap), 0))
     save(row, "phone")
+    for scheme in ("light", "dark"):
+        sheet(shots, scheme).save(images / f"console-all-{scheme}.jpg", quality=82, optimize=True)
+
+
+def sheet(shots: Path, scheme: str, columns: int = 3, width: int = 560) -> Any:
+    """All pages of a colour scheme on one picture: those on a desk in a grid, those on a phone in rows below."""
+    from PIL import Image
+
+    gap, paper = 16, (180, 186, 177)
+    grids = []
+    for size, across in (("desktop", columns), ("phone", 3 * columns)):
+        each = (columns * width + (columns - 1) * gap - (across - 1) * gap) // across
+        pictures = [Image.open(path).convert("RGB") for path in sorted(shots.glob(f"*-{size}-{scheme}.png"))]
+        small = [p.resize((each, round(p.height * each / p.width)), Image.Resampling.LANCZOS) for p in pictures]
+        grids.append([small[k : k + across] for k in range(0, len(small), across)])
+    rows = [row for grid in grids for row in grid]
+    height = sum(max(p.height for p in row) + gap for row in rows) - gap
+    whole = Image.new("RGB", (columns * width + (columns - 1) * gap, height), paper)
+    y = 0
+    for row in rows:
+        x = 0
+        for picture in row:
+            whole.paste(picture, (x, y))
+            x += picture.width + gap
+        y += max(p.height for p in row) + gap
+    return whole
 
 
 def main() -> None:
