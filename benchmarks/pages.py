@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks.timing import table
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {"connectivity-speed.md": ("connectivity", "sealing", "proxies"), "benchmarks.md": ("tasks",)}
+PAGES = {"connectivity-speed.md": ("connectivity", "sealing", "proxies"), "benchmarks.md": ("tasks", "console")}
 """Pages in docs/, and the benchmarks whose tables they have."""
 RESULTS = ROOT / "results" / "benchmarks"
 PLACE = re.compile(r"(?<=<!-- table: )([\w-]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)
@@ -136,6 +136,25 @@ def tasks(results: Results) -> str:
     )
 
 
+def console(results: Results) -> str:
+    """The server under the load of the issue: processors, delays, pictures."""
+    found = results["console"]
+    m, machine = found["measured"], found["machine"]
+    rows: list[list[Any]] = [
+        ["server, % of all cores", f"{m['server_cpu_percent_of_machine']:.0f}", "< 60"],
+        ["round trip of a message, ms, median", f"{m['round_trip_p50_ms']:.1f}", ""],
+        ["round trip of a message, ms, p99", f"{m['round_trip_p99_ms']:.1f}", "< 20"],
+        ["handling of a command, ms, p99 (median over seconds)", f"{m['command_handling_p99_of_a_second_p50_ms']:.2f}", ""],
+        ["timesteps a second", f"{m['timesteps_per_second']:.2f}", "10"],
+        ["pictures a second", f"{m['pictures_per_second']:.0f}", "400"],
+        ["from the robot's state to the picture, ms, median", f"{m['picture_delay_p50_ms']:.0f}", ""],
+        ["swap of weights, ms", f"{m['weights_swap_ms']:.1f}", ""],
+        ["a process that only sleeps, away for ms, p99", f"{m['idle_process_away_p99_ms']:.1f}", ""],
+    ]
+    where = f"{machine['cores']} cores of {machine['processor']}, load before: {machine['load_average_before']}"
+    return f"{table(['', 'measured', 'target'], rows)}\n\nMeasured on {where}."
+
+
 TABLES: dict[str, tuple[str, Callable[[Results], str]]] = {
     "machines": ("", machines),
     "targets": ("connectivity", targets),
@@ -148,6 +167,7 @@ TABLES: dict[str, tuple[str, Callable[[Results], str]]] = {
     "proxies": ("proxies", proxies),
     "proxy-rates": ("proxies", proxy_rates),
     "tasks": ("tasks", tasks),
+    "console": ("console", console),
 }
 """By name, each with the benchmark whose results it needs."""
 
