@@ -164,10 +164,15 @@ def test_steps_end_when_all_have_answered_where_there_is_no_rate(field: Field, f
     try:
         quick.reset()
         drive(lambda: quick.step(STILL), lambda: quick.step(STILL)[-1]["online"].all())
-        before = quick.step(STILL)[-1]["elapsed"]
-        for _ in range(10):
-            after = quick.step(STILL)[-1]["elapsed"]
-        assert (after - before == 10).all()
+
+        def ten_steps() -> bool:
+            """Did each robot make ten timesteps in ten steps? A step also ends at its deadline, on a busy machine."""
+            before = quick.step(STILL)[-1]["elapsed"]
+            for _ in range(10):
+                after = quick.step(STILL)[-1]["elapsed"]
+            return bool((after - before == 10).all())
+
+        assert any(ten_steps() for _ in range(5))
     finally:
         quick.close()
 
