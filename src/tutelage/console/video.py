@@ -102,12 +102,12 @@ class Video:
                     for watcher in list(self._watchers.get(key, ())):
                         watcher.offer(key, picture)
                 await asyncio.sleep(max(0.002, began + 1 / fps - time.monotonic()))
-        except TutelageError as problem:
+        except Exception as problem:  # those who watch must hear of it, whatever it is
+            if not isinstance(problem, TutelageError):
+                log.exception("the stream %s failed", key)
+                problem = TutelageError("an error of the server; its log says more")
             for watcher in self._watchers.pop(key, set()):
                 watcher.refuse("no_picture", f"robot {key[0]}, camera {key[1]}: {problem}")
-        except Exception:
-            log.exception("the stream %s failed", key)
-            self._watchers.pop(key, None)
         finally:
             self._tasks.pop(key, None)
             if key in self._watchers:  # somebody came while it ended
