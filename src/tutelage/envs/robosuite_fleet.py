@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.envs.adapter import AdaptedFleet, Backend, Outcome
+from tutelage.envs.experts.nut_assembly import TABLE_HEIGHT
 from tutelage.errors import ConfigError, MissingExtraError
 from tutelage.fleet.fleet import Mask
 from tutelage.seeding import derive
@@ -46,8 +47,8 @@ try:
 except ImportError as error:
     raise MissingExtraError(error.name or "robosuite", "robosuite") from error
 
-TABLE_HEIGHT, TABLE_HALF = 0.82, 0.4
-"""Height of the table top, and half the length of its sides around the origin, m."""
+TABLE_HALF = 0.4  # m
+"""Half the length of the table's sides around the origin."""
 FREQUENCY = 20
 """Of robosuite's controller, Hz."""
 OBSERVED = (

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from tutelage.envs.experts.inserter import Inserter, Scene
-from tutelage.envs.robosuite_fleet import TABLE_HEIGHT
 from tutelage.envs.tasks.base import Array
+
+TABLE_HEIGHT = 0.82  # m, where the world's coordinates have it
 
 
 class NutInserter(Inserter):
