@@ -149,7 +149,7 @@ def test_messages_that_are_damaged_or_for_another_start_are_counted_and_do_nothi
     other = Command(fleet.server, 30_000_000, 12345, 1, Order.ACT, 0, 0.05, np.ones(2, np.float32))
     for bad in (b"", b"noise" * 100, pack_command(other), pack_command(other)[:-3]):
         fleet._commands[1].send(bad)
-        fleet._stop_lanes[1].send(bad)
+        fleet._tending.lanes[1].send(bad)
         fleet.step(STILL)
     assert not field.notes(2, began, "stop")
     eventually(lambda: fleet.status()[1]["refused_there"] >= 4)

@@ -11,8 +11,6 @@ A reset goes on while the loop does: the robot is out of reach until the first o
 
 from __future__ import annotations
 
-import json
-import logging
 import secrets
 import threading
 import time
@@ -26,53 +24,23 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tutelage.errors import ConfigError, ContractError, TutelageError
-from tutelage.files import write_atomic
+from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet, Mask
 from tutelage.remote import topics
 from tutelage.remote.jpeg import decode
-from tutelage.remote.messages import (
-    Ask,
-    Command,
-    Description,
-    Flag,
-    Malformed,
-    Operation,
-    Order,
-    Stop,
-    StopOperation,
-    Weights,
-)
+from tutelage.remote.messages import Command, Description, Flag, Malformed, Order, Weights
+from tutelage.remote.robots import Robots
 from tutelage.remote.slot import Slot
-from tutelage.remote.wire import (
-    pack_ask,
-    pack_command,
-    pack_stop,
-    pack_weights,
-    unpack_answer,
-    unpack_description,
-    unpack_weights,
-)
+from tutelage.remote.tending import Tending, send
+from tutelage.remote.wire import pack_command, pack_weights, unpack_weights
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
-from tutelage.sgc.publisher import Publisher
 from tutelage.sgc.transport.base import Handle
-from tutelage.sgc.workers import Workers
-
-log = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
 FILE = "fleet.json"
 """In the server's folder: what the robots are, so that a server that starts again need not wait for one of them."""
-
-TEND = 0.05
-ASK_AGAIN = 0.3
-STOP_AGAIN = 0.1
-"""Seconds between two looks at what is owed to the robots, two requests to one, two messages of the emergency stop."""
-
-ANSWER = 3.0
-"""Seconds for which a robot's answer is waited for."""
 
 
 class RemoteFleet(Fleet):
@@ -130,24 +98,21 @@ class RemoteFleet(Fleet):
         if not deadline > 0:
             raise ConfigError(f"the deadline must be more than 0 seconds, not {deadline:g}")
         self.node, self.num_envs, self.hz, self._deadline = node, len(self.names), hz, deadline
+        self._robots = Robots(self.names, deadline, node.home.path / FILE, description)
+        self._slots, self._news = self._robots.slots, self._robots.news
         self.server = secrets.randbits(64) | 1
         self.late = 0.0
         self.metadata = {**self.metadata, "render_fps": round(hz or 10)}
         self._own_node = own_node
-        self._slots = [Slot(name) for name in self.names]
-        self._news = threading.Condition()
         self._closed = threading.Event()
-        self._pool = Workers("fleet-ask", 8, 4 * self.num_envs + 64)
         self._weights: Weights | None = None
         self._served: Handle | None = None
-        self._number = self._asks = self._stops = 0
+        self._number = 0
         self._tick = float("-inf")
         self._active: Mask = np.zeros(self.num_envs, dtype=bool)
         self._started = False
-        self._file = node.home.path / FILE
-        self._description: Description | None = description or self._remembered()
         self._commands = [node.publisher(topics.alias(name, topics.COMMAND)) for name in self.names]
-        self._stop_lanes = [node.publisher(topics.alias(name, topics.STOP)) for name in self.names]
+        self._tending = Tending(node, self._robots, self.server)
         self._subscriptions = []
         for slot in self._slots:
             seen = topics.alias(slot.name, topics.OBSERVATION)
@@ -155,10 +120,9 @@ class RemoteFleet(Fleet):
             for camera in topics.cameras_in(slot.name, set(node.access.topics)):
                 lane = topics.alias(slot.name, topics.PICTURE, camera)
                 self._subscriptions.append(node.subscribe(lane, partial(self._on_picture, slot, camera)))
-        self._tending = threading.Thread(target=self._tend, name="fleet-tend", daemon=True)
         self._tending.start()
         try:
-            self._learn_what_robots_are(wait)
+            self._set_spaces(self._robots.known(wait))
         except BaseException:
             self.close()
             raise
@@ -185,8 +149,8 @@ class RemoteFleet(Fleet):
     @property
     def description(self) -> Description:
         """What each robot is."""
-        assert self._description is not None
-        return self._description
+        assert self._robots.description is not None
+        return self._robots.description
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -207,11 +171,6 @@ class RemoteFleet(Fleet):
     def paces(self) -> bool:
         """Whether `step_wait` sleeps to the next tick."""
         return self.hz is not None
-
-    def _reach(self, slot: Slot) -> float:
-        """Seconds without an observation after which this robot is out of reach."""
-        known = slot.description or self._description
-        return max(self._deadline, 3 * known.dt) if known is not None else self._deadline
 
     # -- the fleet ---------------------------------------------------------------------------------------------------------
 
@@ -238,7 +197,7 @@ class RemoteFleet(Fleet):
             orders = [self._order(i, actions[i], bool(moving[i]), now) for i in range(self.num_envs)]
         for publisher, order in zip(self._commands, orders, strict=True):
             if order is not None:
-                self._send(publisher, order)
+                send(self.node, publisher, order)
 
     def step_wait(self) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
         self._wait()
@@ -247,7 +206,7 @@ class RemoteFleet(Fleet):
         with self._news:
             obs = self._obs.copy()
             now = time.monotonic()
-            states = self._states(now)
+            states = self._robots.states(now)
             for i, slot in enumerate(self._slots):
                 seen, before = slot.newest, slot.delivered
                 if states[i] != "online" or seen is None:
@@ -281,10 +240,9 @@ class RemoteFleet(Fleet):
             subscription.close()
         if self._served is not None:
             self._served.close()
-        for publisher in (*self._commands, *self._stop_lanes):
+        for publisher in self._commands:
             publisher.close()
-        self._pool.close()
-        self._tending.join(2.0)
+        self._tending.close()
         if self._own_node:
             self.node.close()
 
@@ -302,20 +260,12 @@ class RemoteFleet(Fleet):
         A robot that cannot be reached now is stopped when it comes back.
         """
         for i in range(self.num_envs) if robot is None else (robot,):
-            slot = self._slots[i]
-            with self._news:
-                slot.stop, slot.clear = True, False
-            self._send_stop(i, StopOperation.STOP)
+            self._tending.stop(i)
 
     def clear(self, robot: int | None = None) -> None:
         """End the emergency stop of a robot, or of all."""
         for i in range(self.num_envs) if robot is None else (robot,):
-            slot = self._slots[i]
-            with self._news:
-                if not slot.stopped:
-                    continue
-                slot.stop, slot.clear = False, True
-            self._send_stop(i, StopOperation.CLEAR)
+            self._tending.clear(i)
 
     def picture(self, robot: int, camera: int = 0) -> tuple[float, NDArray[np.uint8]] | None:
         """The newest picture of a robot's camera: when it came (seconds since 1970), and (H, W, 3) uint8; None without one.
@@ -368,36 +318,11 @@ class RemoteFleet(Fleet):
     def status(self) -> list[dict[str, Any]]:
         """Of each robot: name, state (never, gone, misfit, asking, stopped, resetting, fault, online), seconds since it was
         heard, round trip in seconds, episode, step, starts, what it and we refused, and what there is to say."""
-        now = time.monotonic()
-        with self._news:
-            rows = []
-            for slot in self._slots:
-                seen = slot.newest
-                rows.append(
-                    {
-                        "name": slot.name,
-                        "state": slot.state(now, self._reach(slot)),
-                        "age": now - slot.heard_at if seen is not None else None,
-                        "round_trip": None if np.isnan(slot.round_trip) else slot.round_trip,
-                        "episode": seen.episode if seen is not None else 0,
-                        "step": seen.step if seen is not None else 0,
-                        "held": slot.has(Flag.HELD),
-                        "starts": slot.starts,
-                        "stale": seen.stale if seen is not None else 0,
-                        "refused_there": seen.refused if seen is not None else 0,
-                        "refused_here": dict(slot.counts.by_reason),
-                        "says": slot.misfit,
-                    }
-                )
-            return rows
+        return self._robots.status()
 
     def refused(self) -> dict[str, int]:
         """What was dropped, by reason: by this fleet, and by the network as not genuine."""
-        total: dict[str, int] = {}
-        with self._news:
-            for slot in self._slots:
-                for reason, count in slot.counts.by_reason.items():
-                    total[reason] = total.get(reason, 0) + count
+        total = self._robots.refused()
         for subscription in self._subscriptions:
             for reason, count in subscription.opener.refusals.as_dict().items():
                 total[f"network_{reason}"] = total.get(f"network_{reason}", 0) + count
@@ -408,7 +333,7 @@ class RemoteFleet(Fleet):
     def _on_observation(self, slot: Slot, message: Message) -> None:
         now = time.monotonic()
         with self._news:
-            if slot.observe(message.payload, self._description, self.server, now):
+            if slot.observe(message.payload, self._robots.description, self.server, now):
                 self._news.notify_all()
 
     def _on_weights(self, message: Message) -> bytes:
@@ -426,18 +351,14 @@ class RemoteFleet(Fleet):
 
     # -- with the lock held -------------------------------------------------------------------------------------------------
 
-    def _states(self, now: float) -> list[str]:
-        return [slot.state(now, self._reach(slot)) for slot in self._slots]
-
     def _online(self, now: float) -> Mask:
         """Those that the loop was told are in reach, and still are."""
-        return np.array(
-            [slot.was_online and state == "online" for slot, state in zip(self._slots, self._states(now), strict=True)]
-        )
+        states = self._robots.states(now)
+        return np.array([slot.was_online and state == "online" for slot, state in zip(self._slots, states, strict=True)])
 
     def _info(self, success: Mask, states: list[str] | None = None) -> dict[str, Any]:
         if states is None:
-            found = self._states(time.monotonic())
+            found = self._robots.states(time.monotonic())
             states = [s if slot.was_online or s != "online" else "new" for slot, s in zip(self._slots, found, strict=True)]
         given = [slot.delivered for slot in self._slots]
         return {
@@ -454,16 +375,12 @@ class RemoteFleet(Fleet):
     def _want_reset(self, slot: Slot, seed: int | None) -> None:
         ended = slot.has(Flag.SUCCESS) or slot.has(Flag.TRUNCATED)
         ended |= slot.delivered is not None and slot.delivered.step >= self.horizon
-        self._asks += 1
-        slot.reset = "soft" if ended and not slot.has(Flag.VIOLATION) else "hard"
-        slot.seed, slot.reset_number, slot.accepted, slot.ask_at = seed, self._asks, None, float("-inf")
-        slot.was_online = False
-        self._news.notify_all()
+        self._tending.reset(slot, soft=ended and not slot.has(Flag.VIOLATION), seed=seed)
 
     def _order(self, i: int, action: Array, moving: bool, now: float) -> bytes | None:
         slot = self._slots[i]
         seen = slot.delivered if moving else slot.newest
-        if seen is None or slot.newest is None or now - slot.heard_at > self._reach(slot):
+        if seen is None or not self._robots.here(slot, now):
             return None
         period = 1.0 / self.hz if self.hz else 0.0
         order, what = (Order.ACT, action) if moving else (Order(0), action[:0])
@@ -491,7 +408,7 @@ class RemoteFleet(Fleet):
 
     def _all_answered(self) -> bool:
         now = time.monotonic()
-        for slot, state in zip(self._slots, self._states(now), strict=True):
+        for slot, state in zip(self._slots, self._robots.states(now), strict=True):
             seen = slot.newest
             if state != "online" or not slot.was_online or seen is None or slot.delivered is None:
                 continue
@@ -500,106 +417,7 @@ class RemoteFleet(Fleet):
                 return False
         return True
 
-    def _send(self, publisher: Publisher, message: bytes) -> None:
-        """The network may not take it (no certificate any more, closed): robots then hold by themselves."""
-        try:
-            publisher.send(message)
-        except TutelageError as error:
-            log.warning("%s: %s", self.node.name, error)
-
-    def _send_stop(self, i: int, operation: StopOperation) -> None:
-        with self._news:
-            self._stops += 1
-            message = pack_stop(Stop(self.server, self._stops, operation))
-            self._slots[i].stop_at = time.monotonic()
-        self._send(self._stop_lanes[i], message)
-
-    def _tend(self) -> None:
-        """What is owed to robots: stops that they do not show yet, resets, and a question who they are."""
-        while not self._closed.is_set():
-            now = time.monotonic()
-            due: list[tuple[int, StopOperation]] = []
-            with self._news:
-                for i, slot in enumerate(self._slots):
-                    here = slot.newest is not None and now - slot.heard_at < self._reach(slot)
-                    if now - slot.stop_at >= STOP_AGAIN and here:
-                        if slot.stop and not slot.has(Flag.STOPPED):
-                            due.append((i, StopOperation.STOP))
-                        elif slot.clear:
-                            due.append((i, StopOperation.CLEAR))
-                    wanted = slot.description is None or (slot.reset and slot.accepted is None and not slot.stopped)
-                    if here and wanted and not slot.asking and now >= slot.ask_at and not slot.misfit:
-                        slot.asking = self._pool.submit(self._ask, slot)
-            for i, operation in due:
-                self._send_stop(i, operation)
-            self._closed.wait(TEND)
-
-    def _ask(self, slot: Slot) -> None:
-        """On the pool: who are you, or please reset."""
-        try:
-            if slot.description is None:
-                self._ask_description(slot)
-            else:
-                self._ask_reset(slot)
-        except TutelageError as error:
-            log.info("%s: %s", slot.name, error)
-        finally:
-            with self._news:
-                slot.asking, slot.ask_at = False, time.monotonic() + ASK_AGAIN
-                self._news.notify_all()
-
-    def _ask_description(self, slot: Slot) -> None:
-        boot = slot.newest.boot if slot.newest is not None else 0
-        with self._news:
-            self._asks += 1
-            ask = pack_ask(Ask(self.server, self._asks, Operation.DESCRIBE))
-        said = unpack_description(self.node.request(topics.alias(slot.name, topics.SERVICE), ask, ANSWER))
-        with self._news:
-            if slot.newest is None or slot.newest.boot != boot:
-                return  # it has started again meanwhile, and is asked again
-            if self._description is None:
-                self._description = said
-                for other in self._slots:
-                    other.settle_on(said)
-                write_atomic(self._file, (json.dumps(said.to_json(), indent=1) + "\n").encode())
-            if said.matches(self._description):
-                slot.description = said
-            else:
-                slot.misfit = _difference(said, self._description)
-                log.warning(
-                    "%s does not fit into this fleet: %s; if the fleet is another one now, remove %s",
-                    slot.name, slot.misfit, self._file,
-                )  # fmt: skip
-
-    def _ask_reset(self, slot: Slot) -> None:
-        with self._news:
-            number = slot.reset_number
-            operation = Operation.HARD_RESET if slot.reset == "hard" else Operation.SOFT_RESET
-            ask = pack_ask(Ask(self.server, number, operation, slot.seed))
-        answer = unpack_answer(self.node.request(topics.alias(slot.name, topics.SERVICE), ask, ANSWER))
-        with self._news:
-            if answer.accepted and slot.reset_number == number:
-                slot.accepted = answer
-                slot.settle()  # it may have been quicker than its answer
-
-    def _remembered(self) -> Description | None:
-        try:
-            return Description.from_json(json.loads(self._file.read_text(encoding="utf-8")))
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError, Malformed) as error:
-            log.warning("%s is of no use (%s); the first robot says what robots are", self._file, error)
-            return None
-
-    def _learn_what_robots_are(self, wait: float) -> None:
-        with self._news:
-            found = self._news.wait_for(lambda: self._description is not None, wait)
-        if not found:
-            raise ConfigError(
-                f"no robot of {', '.join(self.names[:5])}{' ...' if self.num_envs > 5 else ''} answered within {wait:g} s; "
-                "start one: tutelage robot HOME --env TASK"
-            )
-        d = self.description
+    def _set_spaces(self, d: Description) -> None:
         self.horizon, self.goal_conditioned = d.horizon, d.goal
         low, high = (0, 255) if d.dtype == "uint8" else (-np.inf, np.inf)
         self.single_observation_space = gym.spaces.Box(low, high, d.shape, dtype=np.dtype(d.dtype).type)
@@ -608,10 +426,3 @@ class RemoteFleet(Fleet):
         )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-
-
-def _difference(one: Description, other: Description) -> str:
-    for name in ("task", "shape", "dtype", "action_low", "action_high"):
-        if getattr(one, name) != getattr(other, name):
-            return f"{name} {getattr(one, name)!r}, and the fleet has {getattr(other, name)!r}"
-    return ""
