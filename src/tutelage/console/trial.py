@@ -11,9 +11,9 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import json
+import queue
 import secrets
 import signal
-import socket
 import sys
 import tempfile
 import threading
@@ -21,6 +21,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from tutelage.console.accounts import Accounts, Role
 from tutelage.console.audit import Audit
@@ -101,23 +102,20 @@ def trial(config: TrialConfig, out: Path) -> dict[str, Any]:
     for name in names:
         accounts.add(name, Role.OPERATOR, passwords[name])
     accounts.close()
-    port, begun, running = _free_port(), threading.Event(), threading.Event()
+    said: queue.SimpleQueue[str] = queue.SimpleQueue()
     made: list[Supervision] = []
     tallies: list[Tally] = []
     failed: list[BaseException] = []
 
     def open_supervision(audit: Audit) -> Supervision:
         made.append(Supervision.open(config.engine(out), audit))
-        running.set()
         return made[0]
-
-    def say(line: str) -> None:
-        begun.set()
 
     def work() -> None:
         try:
-            running.wait()
-            _until_it_listens(port)
+            while not (line := said.get()).startswith("console: "):  # it listens from then on
+                pass
+            address = urlsplit(line.removeprefix("console: "))
             end = time.monotonic() + PATIENCE
 
             def over() -> bool:
@@ -125,7 +123,7 @@ def trial(config: TrialConfig, out: Path) -> dict[str, Any]:
 
             people = [
                 ScriptedOperator(
-                    f"http://127.0.0.1:{port}", name, passwords[name], config.react, rule=after(config.t_teleop)
+                    f"http://{address.netloc}", name, passwords[name], config.react, rule=after(config.t_teleop)
                 )
                 for name in names
             ]
@@ -141,7 +139,7 @@ def trial(config: TrialConfig, out: Path) -> dict[str, Any]:
 
     worker = threading.Thread(target=work, name="operators", daemon=True)
     worker.start()
-    serve(open_supervision, out, WebConfig(port=port), say)
+    serve(open_supervision, out, WebConfig(port=0), said.put)
     worker.join()
     if failed:
         raise TutelageError(f"an operator failed: {failed[0]}") from failed[0]
@@ -160,25 +158,6 @@ def _plain(tally: Tally) -> dict[str, Any]:
         values = sorted(counts.pop(series))
         counts[f"{series}_median"] = values[len(values) // 2] if values else None
     return counts
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _until_it_listens(port: int) -> None:
-    end = time.monotonic() + 60.0
-    while time.monotonic() < end:
-        try:
-            with socket.create_connection(("127.0.0.1", port), timeout=1.0) as connection:
-                connection.sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
-                if connection.recv(8).startswith(b"HTTP"):
-                    return
-        except OSError:
-            time.sleep(0.1)
-    raise TutelageError("the server did not begin")
 
 
 def main() -> None:
