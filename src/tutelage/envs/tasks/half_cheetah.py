@@ -12,7 +12,7 @@ class HalfCheetah(MujocoTask):
     """17 observations, 6 actions. Gymnasium never ends an episode; here a torso beyond 90 degrees is a violation."""
 
     name, xml, frame_skip, planar = "HalfCheetah", "half_cheetah.xml", 5, True
-    disturbance = "mild"
+    disturbance = "moderate"
     summary = "a planar cheetah runs forward; violation: tipped over (|pitch| > 90 degrees)"
 
     def observe(self, frame: Frame) -> Array:
