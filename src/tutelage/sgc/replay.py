@@ -99,7 +99,9 @@ class Replay:
         """
         self.check_time(sent, now)
         known = self._senders.get(sender)
-        self._check(known, known.windows.get(salt) if known is not None else None, first, 1, sent)
+        window = known.windows.get(salt) if known is not None else None
+        if window is None or first <= window.highest:  # else it is new, as nearly all are
+            self._check(known, window, first, 1, sent)
 
     def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int) -> None:
         """Take a message (a batch of `count`) that is authentic, once. Its time is for `check_time` to check.
@@ -110,7 +112,8 @@ class Replay:
         with self._lock:
             known = self._senders.get(sender)
             window = known.windows.get(salt) if known is not None else None
-            self._check(known, window, first, count, sent)
+            if window is None or first <= window.highest:
+                self._check(known, window, first, count, sent)
             if known is None:
                 known = self._senders[sender] = _Sender(self._floor)
                 if len(self._senders) > MAX_SENDERS:

@@ -21,12 +21,15 @@ from tutelage.sgc.packet import (
     BARE_PROOF,
     BATCH,
     BODY,
+    CHAIN,
     HEADER,
     INTRODUCTION,
     MAX_PAYLOAD,
     MODES,
     PROOF,
     SALT_BYTES,
+    SESSION,
+    SIGNATURE,
     TAG,
     VERSION,
     Buffer,
@@ -38,7 +41,7 @@ from tutelage.sgc.packet import (
     nonce,
 )
 from tutelage.sgc.reasons import Refusals, Refused
-from tutelage.sgc.rules import Authenticity, Lane
+from tutelage.sgc.rules import Lane
 from tutelage.sgc.session import MAX_SESSIONS, SLOT, Handshake, Session, tags
 
 _SIGNATURE = 64
@@ -94,6 +97,7 @@ class Sealer:
         self._versions = (-1, -1)
         self._entry = self._home.access.check(alias, lane, sends=True)
         self._authenticity = self._entry.rule.authenticity_on(lane)
+        self._mode = MODES[self._authenticity]
         self._name = bytes(self._entry.name)
         self._statements = Statements(self._name, lane)
         self._sender = key_id(self._entry.secret, b"sender", self._home.signing_key.public_key())
@@ -150,7 +154,7 @@ class Sealer:
             Refused: not from a node that may receive; see the reason. Counted.
             NotAllowed: the topic's authenticity is not "session".
         """
-        if self._authenticity != Authenticity.SESSION:
+        if self._mode != SESSION:
             raise NotAllowed(f'{self.alias} has authenticity "{self._authenticity}" in the policy, so it has no sessions')
         with self._lock:
             with self.refusals.counting():
@@ -173,10 +177,10 @@ class Sealer:
             first = self.sequence + 1
             self.sequence += count
             introduction = b""
-            if self._authenticity != Authenticity.SESSION and not 0 < self._introduce_at - now <= self._introduce_every:
+            if self._mode != SESSION and not 0 < self._introduce_at - now <= self._introduce_every:
                 introduction = self._home.credential
                 self._introduce_at = now + self._introduce_every
-            if self._authenticity == Authenticity.CHAIN and self._link.due(now):
+            if self._mode == CHAIN and self._link.due(now):
                 flags |= ANCHOR
             introduced = len(introduction) + TAG if introduction else 0
             header = self._header(flags, first, introduced, self._proof_bytes(flags), now)
@@ -194,21 +198,21 @@ class Sealer:
             return packet
 
     def _proof_bytes(self, flags: int) -> int:
-        if self._authenticity == Authenticity.SIGNATURE:
-            return _SIGNATURE + TAG
-        if self._authenticity == Authenticity.SESSION:
+        if self._mode == SESSION:
             return SLOT * len(self._sessions)
+        if self._mode == SIGNATURE:
+            return _SIGNATURE + TAG
         return self._link.proof_bytes(with_message=True) + TAG if flags & ANCHOR else 0
 
     def _proof(
         self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Packet, now: int
     ) -> bytes:
-        if self._authenticity == Authenticity.SESSION:
+        if self._mode == SESSION:
             return tags(self._sessions, header, sealed)
         statement = self._statements.message(header, bind, body)
         key = self._home.signing_key
         # A signature is sealed too: in clear, anyone who knows a node's certificate could tell which packets are its own.
-        if self._authenticity == Authenticity.SIGNATURE:
+        if self._mode == SIGNATURE:
             return cipher.encrypt(nonce(PROOF, header), key.sign(statement), header)
         self._link.add(first, statement, now)
         if not flags & ANCHOR:
@@ -217,8 +221,7 @@ class Sealer:
         return cipher.encrypt(nonce(PROOF, header), anchor, header)
 
     def _header(self, flags: int, first: int, introduction: int, proof: int, now: int) -> bytes:
-        mode = MODES[self._authenticity]
-        return make_header(VERSION, mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now)
+        return make_header(VERSION, self._mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now)
 
     def _look(self, now: int) -> AESGCM:
         """The cipher to use now. Looks from time to time, and at every change, whether this node may still send."""

@@ -163,15 +163,4 @@ class Handshake:
 
 def tags(sessions: list[Session], header: bytes, sealed: Buffer) -> bytes:
     """The proof of a packet: id and tag of every session."""
-    return b"".join(session.ident + session.tag(header, sealed) for session in sessions)
-
-
-def slots(proof: memoryview) -> list[tuple[bytes, memoryview]]:
-    """The sessions of a proof, with their tags.
-
-    Raises:
-        Refused: MALFORMED.
-    """
-    if len(proof) % SLOT or len(proof) > SLOT * MAX_SESSIONS:
-        raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
-    return [(bytes(proof[at : at + SESSION_ID]), proof[at + SESSION_ID : at + SLOT]) for at in range(0, len(proof), SLOT)]
+    return b"".join([session.ident + session.tag(header, sealed) for session in sessions])
