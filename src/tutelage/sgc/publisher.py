@@ -26,6 +26,8 @@ from tutelage.sgc.transport.base import Congested, Transport
 
 log = logging.getLogger(__name__)
 
+_WHOLE = frames.Kind.WHOLE
+
 QUEUE_MESSAGES = 1024
 QUEUE_BYTES = 64 << 20
 BATCH_MESSAGES = 256
@@ -64,7 +66,6 @@ class Publisher:
         self._spread = 1_000_000_000 if entry.rule.max_age is None else int(entry.rule.max_age * 1e8)  # nanoseconds
         self._spacing = SPACING[entry.rule.authenticity]
         self._sealer = sealer
-        self._sealing = threading.Lock()
         self._transport = transport
         self._need_key = need_key
         self._key = lanes.key(entry.name, lanes.STREAM)
@@ -110,19 +111,19 @@ class Publisher:
             ConfigError: the message is too large, or the publisher is closed.
             NotIssued: the node's certificate has expired.
         """
-        if len(payload) > frames.MAX_MESSAGE:
-            raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {len(payload):,} bytes")
-        sent = time.time_ns()
+        size = len(payload)
+        if size > frames.MAX_MESSAGE:
+            raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {size:,} bytes")
+        sent, now = time.time_ns(), time.monotonic()
         with self._lock:
             self._check()
-            alone = not self._busy and not self._queue and len(payload) <= INLINE and time.monotonic() >= self._free_at
+            alone = size <= INLINE and not self._queue and not self._busy and now >= self._free_at
             if alone:
                 self._busy = True
             else:
                 self._enqueue(bytes(payload), sent, wait)
         if alone:
-            batch = [(payload if isinstance(payload, bytes) else bytes(payload), sent)]
-            self._ship(batch)
+            self._ship([(bytes(payload), sent)], now)
 
     def flush(self, timeout: float) -> bool:
         """Wait until everything queued has been handed to the transport; False: it was not within `timeout` seconds."""
@@ -216,20 +217,24 @@ class Publisher:
         self._queued -= size
         return batch
 
-    # -- sealing and sending; `_busy` is set -------------------------------------------------------------------------------
+    # -- sealing and sending; only whoever has set `_busy` does that -------------------------------------------------------
 
-    def _ship(self, batch: list[tuple[bytes, int]]) -> None:
+    def _ship(self, batch: list[tuple[bytes, int]], now: float) -> None:
         """Seal and send; without a key, back into the queue."""
         try:
-            age = time.monotonic() - self._born
-            if len(batch) == 1 and len(batch[0][0]) > frames.PIECE:
-                for piece in frames.pieces(memoryview(batch[0][0]), age):
-                    self._publish([piece], batch[0][1])
+            payload, sent = batch[0]
+            size = len(payload)
+            if len(batch) > 1:
+                head = frames.head(_WHOLE, now - self._born)
+                self._publish([head + payload for payload, _ in batch], sent, now)
+                size = sum([len(payload) for payload, _ in batch])
+            elif size <= frames.PIECE:
+                self._publish([frames.head(_WHOLE, now - self._born) + payload], sent, now)
             else:
-                head = frames.head(frames.Kind.WHOLE, age)
-                self._publish([head + payload for payload, _ in batch], batch[0][1])
+                for piece in frames.pieces(memoryview(payload), now - self._born):
+                    self._publish([piece], sent, now)
             self.sent += len(batch)
-            self.bytes += len(batch[0][0]) if len(batch) == 1 else sum(len(payload) for payload, _ in batch)
+            self.bytes += size
         except NoKey:
             with self._changed:
                 self._queue.extendleft(reversed(batch))
@@ -254,19 +259,18 @@ class Publisher:
             if self._queue or self._waiting or min(self._life_at, self._anchor_at) < self._wakes_at:
                 self._changed.notify_all()
 
-    def _publish(self, payloads: list[bytes], sent: int) -> None:
-        with self._sealing:
-            before = self._sealer.sequence
-            if len(payloads) == 1:
-                packet = self._sealer.seal(payloads[0], now=sent)
-            else:
-                packet = self._sealer.seal_many(payloads, now=sent)
-            self._hand_over(before + 1, packet)
+    def _publish(self, payloads: list[bytes], sent: int, now: float) -> None:
+        before = self._sealer.sequence
+        if len(payloads) == 1:
+            packet = self._sealer.seal(payloads[0], now=sent)
+        else:
+            packet = self._sealer.seal_many(payloads, now=sent)
+        self._hand_over(before + 1, packet, now)
 
-    def _hand_over(self, first: int, packet: bytes | bytearray) -> None:
+    def _hand_over(self, first: int, packet: bytes | bytearray, now: float) -> None:
         if not self._lossy:
             last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
-            self._history.add(min(first, last), last, packet, time.monotonic(), confirms=self._chain and anchored(packet))
+            self._history.add(min(first, last), last, packet, now, confirms=self._chain and anchored(packet))
         self.packets += 1
         self._transport.publish(self._key, packet, reliable=not self._lossy)
 
@@ -296,7 +300,7 @@ class Publisher:
             if not self._busy and self._queue and now >= self._free_at and not self._closing:
                 self._busy = True
                 batch = self._take()
-                return lambda: self._ship(batch)
+                return lambda: self._ship(batch, now)
             if self._closing:
                 return None
             if not self._busy and now >= self._anchor_at:
@@ -314,7 +318,8 @@ class Publisher:
 
     def _show_life(self) -> None:
         try:
-            self._publish([frames.head(frames.Kind.LIFE, time.monotonic() - self._born)], time.time_ns())
+            now = time.monotonic()
+            self._publish([frames.head(frames.Kind.LIFE, now - self._born)], time.time_ns(), now)
         except NoKey:
             self._need_key()
         finally:
@@ -327,11 +332,10 @@ class Publisher:
     def _anchor(self) -> None:
         """Chain mode: confirm what was sent."""
         try:
-            with self._sealing:
-                after = self._sealer.sequence + 1
-                packet = self._sealer.flush()
-                if packet is not None:
-                    self._hand_over(after, packet)
+            after = self._sealer.sequence + 1
+            packet = self._sealer.flush()
+            if packet is not None:
+                self._hand_over(after, packet, time.monotonic())
         finally:
             with self._changed:
                 self._busy = False
@@ -358,8 +362,7 @@ class Publisher:
     def _answer(self, offers: list[bytes]) -> None:
         for offer in offers:
             try:
-                with self._sealing:
-                    answer = self._sealer.accept_session(offer)
+                answer = self._sealer.accept_session(offer)
             except Refused as refused:
                 self.refusals.add(refused.reason)
             except NoKey:

@@ -211,8 +211,7 @@ class Subscription:
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
     def _on_packet(self, packet: bytes) -> None:
-        idle = self._direct and self._inbox.empty() and not self.delivery.crowded
-        if idle and self._turn.acquire(blocking=False):
+        if self._direct and self._inbox.empty() and not self.delivery.crowded and self._turn.acquire(blocking=False):
             try:
                 self._at_once(packet)
             finally:
@@ -320,20 +319,17 @@ class Subscription:
             self._refused(refused.reason, received, packet)
             return []
         self.packets += 1
-        ready: list[Opened] = []
-        accept, now = self.delivery.accept, time.monotonic()
-        for each in opened:
-            ready += accept(each, now)
-        if opened:
-            self._heard(opened[-1], received)
-        return self._messages(ready, received)
+        if not opened:
+            return []
+        self._heard(opened[-1], received)
+        return self._messages(self.delivery.accept_all(opened, time.monotonic()), received)
 
     def _heard(self, opened: Opened, received: float) -> None:
         sender, took = opened.sender, received - opened.sent * 1e-9
-        news = sender not in self.last_heard
+        before = self.latency.get(sender)
         self.last_heard[sender] = received
-        self.latency[sender] = took if news else self.latency[sender] + 0.1 * (took - self.latency[sender])
-        if news and self._held:
+        self.latency[sender] = took if before is None else before + 0.1 * (took - before)
+        if before is None and self._held:
             self._inbox.put(_Retry())  # those that waited for the introduction of this sender
 
     def _refused(self, reason: Reason, received: float, packet: bytes | memoryview) -> None:
@@ -364,26 +360,22 @@ class Subscription:
 
     def _messages(self, opened: list[Opened], received: float) -> list[Message]:
         """Frames in order become messages."""
-        messages = []
-        for each in opened:
-            assembly = self._assemblies.get(each.salt)
-            if assembly is None:
-                assembly = self._begin(each)
+        messages, alias = [], self.alias
+        for frame, sender, sequence, salt, sent, _, authentic, _ in opened:
             try:
-                payload = assembly.take(each.sequence, each.payload)
+                payload = (self._assemblies.get(salt) or self._begin(salt)).take(sequence, frame)
             except Refused as refused:
                 self.opener.refusals.add(refused.reason)
                 continue
             if payload is not None:
-                messages.append(
-                    Message(payload, each.sender, self.alias, each.sequence, each.sent * 1e-9, received, each.authentic)
-                )
+                messages.append(Message(payload, sender, alias, sequence, sent * 1e-9, received, authentic))
         return messages
 
-    def _begin(self, first: Opened) -> frames.Assembly:
+    def _begin(self, salt: bytes) -> frames.Assembly:
         """A sender has started; what an earlier start of it left incomplete is forgotten."""
-        self._assemblies = {salt: a for salt, a in self._assemblies.items() if salt in self.delivery.salts()}
-        assembly = self._assemblies[first.salt] = frames.Assembly()
+        present = self.delivery.salts()
+        self._assemblies = {each: assembly for each, assembly in self._assemblies.items() if each in present}
+        assembly = self._assemblies[salt] = frames.Assembly()
         return assembly
 
     def _mend(self) -> None:
