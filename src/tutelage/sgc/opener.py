@@ -21,37 +21,34 @@ from tutelage.sgc.packet import (
     BATCH,
     BODY,
     CHAIN,
-    COUNTERS,
-    EPOCH,
     HEADER,
     INTRODUCTION,
-    LAYOUT,
     MAX_PACKET,
     MODES,
     PROOF,
-    SALT,
-    SENDER,
     SESSION,
+    SESSION_ID,
     SIGNATURE,
-    START,
-    STREAM,
+    SLOT,
     TAG,
     Buffer,
     Opened,
     Statements,
     message_key,
     nonce,
-    read_counters,
+    read_header,
     read_layout,
+    read_stream,
     split_batch,
 )
 from tutelage.sgc.reasons import Reason, Refusals, Refused
 from tutelage.sgc.replay import MAX_SENDERS, Replay
 from tutelage.sgc.rules import Lane, Role
-from tutelage.sgc.session import MAX_SESSIONS, SESSION_ID, SLOT, Handshake, Session
+from tutelage.sgc.session import Handshake, Session
 from tutelage.sgc.trust import Member
 
 _LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys and policy
+_NEVER = -1
 _MAX_STREAMS = 1024
 _MAX_SESSIONS = 1024
 
@@ -90,7 +87,7 @@ class Opener:
         self._confirmation = Confirmation(self._statements, self.refusals, provisional=provisional)
         self._handshake = Handshake(self._home, self._entry, lane)
         self._lock = threading.RLock()
-        self._looked = 0
+        self._looked = self._look_at = 0
         self._versions = (-1, -1)
         self._look_count = 0
         self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
@@ -148,22 +145,25 @@ class Opener:
             return session.member.node
 
     def _open(self, packet: memoryview, bind: bytes, now: int) -> list[Opened]:
-        size, raw = len(packet), bytes(packet[:HEADER])
+        size = len(packet)
         if size > MAX_PACKET:
             raise Refused(Reason.OVERSIZE, f"a packet of {size} bytes; {MAX_PACKET} are allowed")
         if size < HEADER + TAG:
             raise Refused(Reason.MALFORMED, f"a packet of {size} bytes")
-        flags, introduction, proof = read_layout(raw[LAYOUT], self._mode)
-        first, sent = read_counters(raw, COUNTERS)
+        raw = bytes(packet[:HEADER])
+        layout, name, first, sent = read_header(raw)
+        flags, introduction, proof = read_layout(layout, self._mode)
         start, end = HEADER + introduction, size - proof
         if first == 0 or start + TAG > end:
             raise Refused(Reason.MALFORMED, "a packet with an impossible header")
-        sender, salt = raw[SENDER], raw[SALT]
-        bare = flags & BARE
-        if not bare:
-            self._replay.check(sender, salt, first, sent, now)  # cheap, so first
-        stream = self._stream(raw, introduction > 0, now)
-        if bare:
+        stream = self._streams.get(name) or _Stream(name)  # of a new one nothing is kept yet: anybody can make up a salt
+        if not flags & BARE:
+            self._replay.check(stream.sender, stream.salt, first, sent, now)  # cheap, so first
+        if not self._looked <= now <= self._look_at or self._versions != (self._keyring.version, self._home.version):
+            self._look(now)
+        if stream.look != self._look_count:
+            self._look_at_stream(stream, introduction > 0, now)
+        if flags & BARE:
             _decrypt(stream.cipher, BARE_BODY, packet[start:end], raw)
             member = self._member(stream, raw, packet[HEADER:start], now)
             return self._anchor(stream, BARE_PROOF, raw, packet[end:], member, now)
@@ -172,11 +172,14 @@ class Opener:
             member = self._session_member(stream, raw, packet, end, now)
         else:
             member = self._member(stream, raw, packet[HEADER:start], now)
-        parts = split_batch(body) if flags & BATCH else [body]
-        node, epoch, authentic, began = member.node, stream.epoch, self._authentic, raw[START]
-        messages = [
-            Opened(part, node, sequence, salt, sent, epoch, authentic, began) for sequence, part in enumerate(parts, first)
-        ]
+        epoch, salt, authentic, began = stream.epoch, stream.salt, self._authentic, stream.start
+        if flags & BATCH:
+            messages = [
+                Opened(part, member.node, sequence, salt, sent, epoch, authentic, began)
+                for sequence, part in enumerate(split_batch(body), first)
+            ]
+        else:
+            messages = [Opened(body, member.node, first, salt, sent, epoch, authentic, began)]
         if self._mode == CHAIN:
             return self._chained(stream, flags, raw, bind, body, packet[end:], member, messages, now)
         if self._mode == SIGNATURE:
@@ -185,9 +188,9 @@ class Opener:
                 member.signing.verify(signature, self._statements.message(raw, bind, body))
             except InvalidSignature:
                 raise Refused(Reason.FORGED, f"a message of {self.alias} that {member.node} did not sign") from None
-        self._replay.admit(sender, salt, first, len(messages), sent)
+        self._replay.admit(stream.sender, salt, first, len(messages), sent)
         if stream.member is not member:
-            self._remember(stream, raw, member)
+            self._remember(stream, member)
         return messages
 
     def _chained(
@@ -202,14 +205,13 @@ class Opener:
         messages: list[Opened],
         now: int,
     ) -> list[Opened]:
-        sender, salt, (first, sent) = raw[SENDER], raw[SALT], read_counters(raw, COUNTERS)
-        statement = self._statements.message(raw, bind, body)
+        statement, first = self._statements.message(raw, bind, body), messages[0].sequence
         with self._lock:
-            ready = self._confirmation.message((sender, salt), first, statement, messages, len(body), now)
+            ready = self._confirmation.message((stream.sender, stream.salt), first, statement, messages, len(body), now)
         if ready is not None:
-            self._replay.admit(sender, salt, first, len(ready), sent)
+            self._replay.admit(stream.sender, stream.salt, first, len(ready), messages[0].sent)
         if stream.member is not member:
-            self._remember(stream, raw, member)
+            self._remember(stream, member)
         if flags & ANCHOR:
             return (ready or []) + self._anchor(stream, PROOF, raw, proof, member, now)
         return ready or []
@@ -217,63 +219,46 @@ class Opener:
     def _anchor(
         self, stream: _Stream, purpose: bytes, raw: bytes, proof: memoryview, member: Member, now: int
     ) -> list[Opened]:
-        sender, salt = raw[SENDER], raw[SALT]
         anchor = _decrypt(stream.cipher, purpose, proof, raw)
 
         def admit(first: int, messages: list[Opened]) -> None:
             self._replay.check_time(messages[0].sent, now)
-            self._replay.admit(sender, salt, first, len(messages), messages[0].sent)
+            self._replay.admit(stream.sender, stream.salt, first, len(messages), messages[0].sent)
 
         with self._lock:
-            return self._confirmation.anchor((sender, salt), anchor, member.signing, admit)
+            return self._confirmation.anchor((stream.sender, stream.salt), anchor, member.signing, admit)
 
-    def _stream(self, raw: bytes, introduced: bool, now: int) -> _Stream:
-        """What is known of the packet's stream; of a new one nothing is kept yet, as anybody can make up a salt.
-
-        Looks from time to time, and at every change: is the epoch accepted, may the sender still send, may we receive?
-        """
-        if (
-            now - self._looked > _LOOK_EVERY
-            or now < self._looked
-            or self._versions != (self._keyring.version, self._home.version)
-        ):
-            self._look(now)
-        stream = self._streams.get(raw[STREAM])
-        if stream is not None and stream.look == self._look_count:
-            return stream
-        epoch = int.from_bytes(raw[EPOCH], "big")
-        key = self._keyring.opening(self.alias, epoch, now / 1e9).key
-        if stream is None:
-            cipher = message_key(key, self._name, self.lane, epoch, raw[SENDER], raw[SALT])
-            return _Stream(AESGCM(cipher), epoch, self._look_count)
-        if stream.member is not None and not introduced:
+    def _look_at_stream(self, stream: _Stream, introduced: bool, now: int) -> None:
+        """Is its epoch accepted, may its sender still send? To be asked after each look."""
+        key = self._keyring.opening(self.alias, stream.epoch, now / 1e9).key
+        if stream.look == _NEVER:
+            stream.cipher = AESGCM(message_key(key, self._name, self.lane, stream.epoch, stream.sender, stream.salt))
+        elif stream.member is not None and not introduced:
             self._check(stream.member, now)
         stream.look = self._look_count
-        return stream
 
-    def _remember(self, stream: _Stream, raw: bytes, member: Member) -> None:
+    def _remember(self, stream: _Stream, member: Member) -> None:
         """Keep what an authentic packet taught."""
         with self._lock:
             stream.member = member
-            self._streams[raw[STREAM]] = stream
+            self._streams[stream.name] = stream
             while len(self._streams) > _MAX_STREAMS:
                 self._streams.popitem(last=False)
             if self._mode != SESSION:
-                self._members[raw[SENDER]] = member
+                self._members[stream.sender] = member
                 while len(self._members) > MAX_SENDERS:
                     self._members.popitem(last=False)
 
     def _member(self, stream: _Stream, raw: bytes, introduction: memoryview, now: int) -> Member:
         """Who the sender is, from its introduction or an earlier one; it may send, now."""
-        sender = raw[SENDER]
         if introduction:
             member = self._home.trust.read(_decrypt(stream.cipher, INTRODUCTION, introduction, raw))
-            if self._id_of(member) != sender:
+            if self._id_of(member) != stream.sender:
                 raise Refused(Reason.FORGED, f"a packet of {self.alias} with the credential of another, {member.node}")
         elif stream.member is not None:
-            return stream.member  # `_stream` has checked it
+            return stream.member  # `_look_at_stream` has checked it
         else:
-            found = self._members.get(sender) or self._from_keyring(sender)
+            found = self._members.get(stream.sender) or self._from_keyring(stream.sender)
             if found is None:
                 raise Refused(Reason.UNKNOWN_SENDER, f"a packet of {self.alias} by a sender that is not introduced yet")
             member = found
@@ -281,14 +266,12 @@ class Opener:
         return member
 
     def _session_member(self, stream: _Stream, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
-        proof, began = bytes(packet[end:]), raw[START]
-        if len(proof) % SLOT or len(proof) > SLOT * MAX_SESSIONS:
-            raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
-        for at in range(0, len(proof), SLOT):
-            session = self._sessions.get(began + proof[at : at + SESSION_ID])
-            if session is not None and now / 1e9 < session.until:
-                session.check(raw, packet[:end], proof[at + SESSION_ID : at + SLOT])
-                if session.member is not stream.member:  # else `_stream` has checked it
+        """Who the sender is, from the tag that it made for us."""
+        for at in range(end, len(packet), SLOT):
+            session = self._sessions.get(stream.start + packet[at : at + SESSION_ID])
+            if session is not None and now < session.until:
+                session.check(raw, packet[:end], packet[at + SESSION_ID : at + SLOT])
+                if session.member is not stream.member:  # else `_look_at_stream` has checked it
                     self._check(session.member, now)
                 return session.member
         raise Refused(Reason.NO_SESSION, f"a packet of {self.alias} by a sender with whom no session is open")
@@ -312,7 +295,7 @@ class Opener:
                 if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
                     raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
                 self._replay.set_max_age(self._entry.rule.max_age)
-            self._versions, self._looked = versions, now
+            self._versions, self._looked, self._look_at = versions, now, now + _LOOK_EVERY
             self._look_count += 1
 
 
@@ -320,16 +303,22 @@ class _Stream:
     """One start of one sender under one epoch.
 
     Attributes:
-        cipher: of its packets.
-        epoch: of the key.
+        name: epoch, sender and salt, as in a header.
+        start: sender and salt.
+        cipher: of its packets; not there before the first look.
         look: when it was last checked, in looks.
         member: who it is; None before the first authentic packet.
     """
 
-    __slots__ = ("cipher", "epoch", "look", "member")
+    __slots__ = ("cipher", "epoch", "look", "member", "name", "salt", "sender", "start")
 
-    def __init__(self, cipher: AESGCM, epoch: int, look: int) -> None:
-        self.cipher, self.epoch, self.look = cipher, epoch, look
+    cipher: AESGCM
+
+    def __init__(self, name: bytes) -> None:
+        self.name = name
+        self.epoch, self.sender, self.salt = read_stream(name)
+        self.start: bytes = self.sender + self.salt
+        self.look = _NEVER
         self.member: Member | None = None
 
 

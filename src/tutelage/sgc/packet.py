@@ -40,14 +40,14 @@ SIGNATURE, SESSION, CHAIN = 1, 2, 3
 MODES = {Authenticity.SIGNATURE: SIGNATURE, Authenticity.SESSION: SESSION, Authenticity.CHAIN: CHAIN}
 _HEADER = struct.Struct(">BBHHHI16s16sQQ")
 _LAYOUT = struct.Struct(">BBHHH")
+_STREAM = struct.Struct(">I16s16s")
 HEADER = _HEADER.size
 _FLAGS = 3
-LAYOUT, EPOCH, SENDER, SALT, SEQUENCE = slice(0, 8), slice(8, 12), slice(12, 28), slice(28, 44), slice(44, 52)
-"""Parts of a header."""
-STREAM, START, IDENT = slice(8, 44), slice(12, 44), slice(12, 52)
-"""Epoch, sender and salt; sender and salt; sender, salt and sequence."""
-COUNTERS = 44
-"""Where sequence and time of sending lie."""
+_IDENT, _SEQUENCE = slice(12, 52), slice(44, 52)
+SESSION_ID = 8
+SLOT = SESSION_ID + TAG
+"""Bytes of a session in a proof: its id, and a tag."""
+MAX_SESSIONS = 16
 MAX_PACKET = HEADER + MAX_PAYLOAD + 4 * (MAX_BATCH + 1) + TAG + 2 * MAX_PART
 _CONTEXT = b"tutelage message 1"
 _CHUNK = 1 << 20
@@ -71,13 +71,16 @@ class Layout(NamedTuple):
 make_header = _HEADER.pack
 """The fields of a header as bytes: all that the table above names, in its order."""
 
-read_counters = struct.Struct(">QQ").unpack_from
-"""Sequence and time of sending, from a buffer and an offset, which is `COUNTERS` in a header."""
+read_header = struct.Struct(">8s36sQQ").unpack
+"""The layout in 8 bytes, the stream in 36, and two numbers: sequence and time of sending."""
+
+read_stream = _STREAM.unpack
+"""Epoch, sender and salt."""
 
 
 @lru_cache(256)
 def read_layout(start: bytes, mode: int) -> Layout:
-    """Read the first bytes of a packet (`LAYOUT`), if it is one of ours of this mode. Most packets begin alike.
+    """Read the layout of a packet, if it is one of ours of this mode. Most packets begin alike.
 
     Raises:
         Refused: MALFORMED or WRONG_MODE.
@@ -89,12 +92,14 @@ def read_layout(start: bytes, mode: int) -> Layout:
         raise Refused(Reason.WRONG_MODE, f"authenticity {found}, and the policy says {mode}")
     if flags > 7 or (flags & (ANCHOR | BARE) and (mode != CHAIN or not flags & ANCHOR)):
         raise Refused(Reason.MALFORMED, "a packet with flags of another mode")
+    if mode == SESSION and (proof % SLOT or proof > SLOT * MAX_SESSIONS):
+        raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
     return Layout(flags, introduction, proof)
 
 
 def ident(packet: Buffer) -> bytes:
     """40 bytes that identify a packet: sender, salt and sequence. A reply binds to that of its request."""
-    return bytes(memoryview(packet)[IDENT])
+    return bytes(memoryview(packet)[_IDENT])
 
 
 def anchored(packet: Buffer) -> bool:
@@ -105,7 +110,7 @@ def anchored(packet: Buffer) -> bool:
 def nonce(purpose: bytes, header: bytes) -> bytes:
     """12 bytes that never repeat under one key: what for, and the sequence number in a header. Keys differ by salt, and a
     salt is never used twice."""
-    return purpose + header[SEQUENCE]
+    return purpose + header[_SEQUENCE]
 
 
 def message_key(epoch_key: bytes, name: bytes, lane: Lane, epoch: int, sender: bytes, salt: bytes) -> bytes:

@@ -87,6 +87,7 @@ class Publisher:
         session = entry.rule.authenticity == Authenticity.SESSION
         self._life_at = self._born if session else float("inf")  # receivers without a session learn that we are there
         self._pause = FIRST_LIFE
+        self._first_life = float("inf") if self._lossy else FIRST_LIFE
         self._anchor_every: float = getattr(sealer, "anchor_every", 0.02)
         self._chain = entry.rule.authenticity == Authenticity.CHAIN
         self._anchor_at = float("inf")
@@ -116,7 +117,8 @@ class Publisher:
             raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {size:,} bytes")
         sent, now = time.time_ns(), time.monotonic()
         with self._lock:
-            self._check()
+            if self._closing or self._failure is not None:
+                self._check()
             alone = size <= INLINE and not self._queue and not self._busy and now >= self._free_at
             if alone:
                 self._busy = True
@@ -251,28 +253,29 @@ class Publisher:
         with self._lock:
             self._busy = False
             self._free_at = max(self._free_at, now + self._spacing)
-            self._pause = FIRST_LIFE
-            self._life_at = now + FIRST_LIFE if not self._lossy else float("inf")
+            self._pause, self._life_at = FIRST_LIFE, now + self._first_life
             if self._chain:
                 self._anchor_at = min(self._anchor_at, now + self._anchor_every)
             # The worker is woken only if it must do something sooner than it thinks: a wake costs more than a small message.
-            if self._queue or self._waiting or min(self._life_at, self._anchor_at) < self._wakes_at:
+            wakes_at = self._wakes_at
+            if self._queue or self._waiting or self._life_at < wakes_at or self._anchor_at < wakes_at:
                 self._changed.notify_all()
 
     def _publish(self, payloads: list[bytes], sent: int, now: float) -> None:
-        before = self._sealer.sequence
         if len(payloads) == 1:
-            packet = self._sealer.seal(payloads[0], now=sent)
+            self._hand_over(1, self._sealer.seal(payloads[0], now=sent), now)
         else:
-            packet = self._sealer.seal_many(payloads, now=sent)
-        self._hand_over(before + 1, packet, now)
+            self._hand_over(len(payloads), self._sealer.seal_many(payloads, now=sent), now)
 
-    def _hand_over(self, first: int, packet: bytes | bytearray, now: float) -> None:
-        if not self._lossy:
-            last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
-            self._history.add(min(first, last), last, packet, now, confirms=self._chain and anchored(packet))
-        self.packets += 1
-        self._transport.publish(self._key, packet, reliable=not self._lossy)
+    def _hand_over(self, count: int, packet: bytes | bytearray, now: float) -> None:
+        """To the network, and into the history, which nobody can ask for it before it or a later one has gone out."""
+        try:
+            self._transport.publish(self._key, packet, reliable=not self._lossy)
+        finally:
+            self.packets += 1
+            if not self._lossy:
+                last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
+                self._history.add(last + 1 - count, last, packet, now, confirms=self._chain and anchored(packet))
 
     # -- the worker --------------------------------------------------------------------------------------------------------
 
@@ -327,15 +330,14 @@ class Publisher:
             self._idle()
             with self._changed:
                 self._pause = min(2 * pause, LAST_LIFE)
-                self._life_at = time.monotonic() + self._pause if not self._lossy else float("inf")
+                self._life_at = time.monotonic() + max(self._pause, self._first_life)
 
     def _anchor(self) -> None:
         """Chain mode: confirm what was sent."""
         try:
-            after = self._sealer.sequence + 1
             packet = self._sealer.flush()
             if packet is not None:
-                self._hand_over(after, packet, time.monotonic())
+                self._hand_over(1, packet, time.monotonic())
         finally:
             with self._changed:
                 self._busy = False

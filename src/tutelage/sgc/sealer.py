@@ -25,11 +25,13 @@ from tutelage.sgc.packet import (
     HEADER,
     INTRODUCTION,
     MAX_PAYLOAD,
+    MAX_SESSIONS,
     MODES,
     PROOF,
     SALT_BYTES,
     SESSION,
     SIGNATURE,
+    SLOT,
     TAG,
     VERSION,
     Buffer,
@@ -42,7 +44,7 @@ from tutelage.sgc.packet import (
 )
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.rules import Lane
-from tutelage.sgc.session import MAX_SESSIONS, SLOT, Handshake, Session, tags
+from tutelage.sgc.session import Handshake, Session, tags
 
 _SIGNATURE = 64
 _SMALL = 65_536  # bytes up to which copying is cheaper than writing in place
@@ -93,7 +95,7 @@ class Sealer:
         self._link = Link(anchor_every)
         self._sessions: list[Session] = []
         self._epoch = 0
-        self._looked = 0
+        self._looked = self._look_at = 0
         self._versions = (-1, -1)
         self._entry = self._home.access.check(alias, lane, sends=True)
         self._authenticity = self._entry.rule.authenticity_on(lane)
@@ -226,7 +228,7 @@ class Sealer:
     def _look(self, now: int) -> AESGCM:
         """The cipher to use now. Looks from time to time, and at every change, whether this node may still send."""
         versions = (self._keyring.version, self._home.version)
-        if self._cipher is not None and versions == self._versions and 0 <= now - self._looked < _LOOK_EVERY:
+        if self._cipher is not None and self._looked <= now < self._look_at and versions == self._versions:
             return self._cipher
         seconds = now / 1e9
         self._home.refresh()
@@ -238,13 +240,13 @@ class Sealer:
         if epoch.number != self._epoch or self._cipher is None:
             key = message_key(epoch.key, self._name, self.lane, epoch.number, self._sender, self.salt)
             self._cipher, self._epoch = AESGCM(key), epoch.number
-        self._sessions = [session for session in self._sessions if self._alive(session, seconds)]
-        self._versions, self._looked = versions, now
+        self._sessions = [session for session in self._sessions if self._alive(session, now)]
+        self._versions, self._looked, self._look_at = versions, now, now + _LOOK_EVERY
         return self._cipher
 
-    def _alive(self, session: Session, now: float) -> bool:
+    def _alive(self, session: Session, now: int) -> bool:
         try:
-            self._home.trust.check(session.member, now)
+            self._home.trust.check(session.member, now / 1e9)
         except Refused:
             return False
         return now < session.until and self._entry.rule.may_receive(session.member.node, self.lane)
