@@ -185,18 +185,21 @@ class Sealer:
             if self._mode == CHAIN and self._link.due(now):
                 flags |= ANCHOR
             introduced = len(introduction) + TAG if introduction else 0
-            header = self._header(flags, first, introduced, self._proof_bytes(flags), now)
+            proof = self._proof_bytes(flags)
+            header = self._header(flags, first, introduced, proof, now)
             if not introduced and len(body) <= _SMALL:
                 sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind)
                 return sealed + self._proof(cipher, header, bind, body, flags, first, sealed, now)
-            start = HEADER + introduced  # of the ciphertext; written in place, as every copy of a large message counts
-            packet = bytearray(start + len(body) + TAG)
-            packet[:HEADER] = header
+            # Written in place, at its full length from the beginning: every copy of a large message counts.
+            start = HEADER + introduced
+            end = start + len(body) + TAG
+            packet = bytearray(end + proof)
             with memoryview(packet) as view:
+                view[:HEADER] = header
                 if introduction:
                     cipher.encrypt_into(nonce(INTRODUCTION, header), introduction, header, view[HEADER:start])
-                cipher.encrypt_into(nonce(BODY, header), body, header + bind, view[start:])
-            packet += self._proof(cipher, header, bind, body, flags, first, packet, now)
+                cipher.encrypt_into(nonce(BODY, header), body, header + bind, view[start:end])
+                view[end:] = self._proof(cipher, header, bind, body, flags, first, view[:end], now)
             return packet
 
     def _proof_bytes(self, flags: int) -> int:
@@ -207,7 +210,7 @@ class Sealer:
         return self._link.proof_bytes(with_message=True) + TAG if flags & ANCHOR else 0
 
     def _proof(
-        self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Packet, now: int
+        self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Buffer, now: int
     ) -> bytes:
         if self._mode == SESSION:
             return tags(self._sessions, header, sealed)
