@@ -30,8 +30,8 @@ _WHOLE = frames.Kind.WHOLE
 
 QUEUE_MESSAGES = 1024
 QUEUE_BYTES = 64 << 20
-BATCH_MESSAGES = 256
-BATCH_BYTES = 128 << 10
+BATCH_MESSAGES, BATCH_BYTES = 256, 256 << 10
+"""What a packet holds at most, unless one message is larger: so much that a signature is a small part of what it costs."""
 INLINE = 16 << 10
 """Bytes of the largest message that is sealed in the caller's thread: so much the system's own buffers always take."""
 
@@ -180,17 +180,21 @@ class Publisher:
             self._queued = 0
 
         size = len(payload)
-        if not self._room(size) and not self._wait(lambda: self._closing or self._room(size), wait):
+        if not self._room(size):
+            self._wait_for_room(size, wait)
+        self._queue.append((payload, sent))
+        self._queued += size
+        if len(self._queue) == 1:  # else the worker knows that there is something to send
+            self._changed.notify_all()
+
+    def _wait_for_room(self, size: int, timeout: float) -> None:
+        if not self._wait(lambda: self._closing or self._room(size), timeout):
             self.congested += 1
             raise Congested(
                 f"the queue of {self.alias} is full ({len(self._queue)} messages): the network is slower than the sender; "
                 "send less, or use a lossy topic"
             )
         self._check()
-        self._queue.append((payload, sent))
-        self._queued += size
-        if len(self._queue) == 1:  # else the worker knows that there is something to send
-            self._changed.notify_all()
 
     def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
         """Until the worker or whoever sends has brought it about."""
@@ -205,17 +209,16 @@ class Publisher:
 
     def _take(self) -> list[tuple[bytes, int]]:
         """What goes out next: small messages together, a large one alone. A packet has the age of its oldest message."""
-        batch = [self._queue.popleft()]
+        queue = self._queue
+        batch = [queue.popleft()]
         size = len(batch[0][0])
         until = batch[0][1] + self._spread
-        while (
-            self._queue
-            and len(batch) < BATCH_MESSAGES
-            and size + len(self._queue[0][0]) <= BATCH_BYTES
-            and self._queue[0][1] <= until
-        ):
-            batch.append(self._queue.popleft())
-            size += len(batch[-1][0])
+        while queue and len(batch) < BATCH_MESSAGES:
+            payload, sent = queue[0]
+            if size + len(payload) > BATCH_BYTES or sent > until:
+                break
+            batch.append(queue.popleft())
+            size += len(payload)
         self._queued -= size
         return batch
 

@@ -127,7 +127,9 @@ class Sealer:
         Raises:
             As `seal`.
         """
-        return self._seal(join_batch([_flat(payload) for payload in payloads]), BATCH, len(payloads), b"", now)
+        return self._seal(
+            join_batch([p if isinstance(p, bytes) else _flat(p) for p in payloads]), BATCH, len(payloads), b"", now
+        )
 
     def introduce(self) -> None:
         """Let the next packet carry this node's credential, as a receiver said that it does not know us."""
