@@ -99,7 +99,7 @@ class Delivery(ABC):
         """Take a message, with its frame; returns those that are to be delivered now."""
 
     def accept_all(self, messages: list[Opened], now: float) -> list[Opened]:
-        """The same for all messages of a packet."""
+        """The same for all messages of a packet, of which there is at least one."""
         return [ready for message in messages for ready in self.accept(message, now)]
 
     def due(self, now: float) -> list[Opened]:
@@ -160,17 +160,12 @@ class InOrder(Delivery):
         self._gapped: dict[str, Stream] = {}  # those with a gap, by sender
 
     def accept_all(self, messages: list[Opened], now: float) -> list[Opened]:
-        if messages:
-            first, last, count = messages[0], messages[-1].sequence, len(messages)
-            known = self._current.get(first.sender)
-            if (
-                known is not None
-                and first.sequence == known.next
-                and last - first.sequence == count - 1
-                and first.salt == known.salt
-                and not known.held
-            ):
-                known.next += count
+        first, count = messages[0], len(messages)
+        known = self._current.get(first.sender)
+        if known is not None and first.sequence == known.next and first.salt == known.salt and not known.held:
+            after = known.next + count
+            if count == 1 or messages[-1].sequence == after - 1:
+                known.next = after
                 return messages  # as nearly always
         return super().accept_all(messages, now)
 

@@ -190,11 +190,17 @@ class Subscription:
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
     def _on_packet(self, packet: bytes) -> None:
+        if self.outlet.closed.is_set():
+            return
         if self._direct and self._inbox.empty() and not self.delivery.crowded and self._turn.acquire(blocking=False):
             try:
-                self._at_once(packet)
+                self.outlet.give(self._take(time.time(), packet))
+            except Exception:
+                log.exception("subscription of %s", self.alias)
             finally:
                 self._turn.release()
+            if self.delivery.wake() is not None:
+                self._look_again()  # our thread sees to the gap
             return
         with self._lock:
             waiting, size = self._inbox.qsize(), self._inbox_bytes + len(packet)
@@ -206,17 +212,6 @@ class Subscription:
         if full:
             self._drop_oldest()
         self._inbox.put((time.time(), packet))
-
-    def _at_once(self, packet: bytes) -> None:
-        """Deal with a packet on the network's thread; what takes time or has to wait is left to our own."""
-        if self.outlet.closed.is_set():
-            return
-        try:
-            self.outlet.give(self._take(time.time(), packet))
-        except Exception:
-            log.exception("subscription of %s", self.alias)
-        if self.delivery.wake() is not None:
-            self._look_again()  # our thread sees to the gap
 
     def _drop_oldest(self) -> None:
         try:
