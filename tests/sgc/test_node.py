@@ -12,7 +12,7 @@ import pytest
 from sgc.fleets import Fleet, eventually, service, topic
 
 from tutelage.errors import ConfigError
-from tutelage.sgc import lanes
+from tutelage.sgc import backlog, lanes
 from tutelage.sgc import publisher as publishing
 from tutelage.sgc.errors import NotAllowed, NotIssued
 from tutelage.sgc.history import make_request
@@ -304,7 +304,7 @@ def test_a_busy_lossy_publisher_sends_the_newest(arm: Node, server: Node, monkey
 
 
 def test_a_network_that_takes_nothing_is_seen_by_the_sender(arm: Node, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publishing, "QUEUE_MESSAGES", 10)
+    monkeypatch.setattr(backlog, "QUEUE_MESSAGES", 10)
     log, gate = arm.publisher("log-signature"), threading.Event()
     stuck = threading.Event()
     monkeypatch.setattr(arm.transport, "publish", lambda *args, **options: stuck.set() or gate.wait(5.0))

@@ -17,6 +17,7 @@ from typing import Self
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.sgc import frames, lanes
 from tutelage.sgc.access import Authenticity, Delivery, Entry
+from tutelage.sgc.backlog import Backlog, Batch
 from tutelage.sgc.errors import NoKey
 from tutelage.sgc.history import History, parse_request
 from tutelage.sgc.packet import anchored
@@ -28,10 +29,6 @@ log = logging.getLogger(__name__)
 
 _WHOLE = frames.Kind.WHOLE
 
-QUEUE_MESSAGES = 1024
-QUEUE_BYTES = 64 << 20
-BATCH_MESSAGES, BATCH_BYTES = 256, 256 << 10
-"""What a packet holds at most, unless one message is larger: so much that a signature is a small part of what it costs."""
 INLINE = 16 << 10
 """Bytes of the largest message that is sealed in the caller's thread: so much the system's own buffers always take."""
 
@@ -63,7 +60,6 @@ class Publisher:
         self.sent = self.packets = self.bytes = self.congested = self.superseded = self.answered = 0
         self._rule = entry.rule
         self._lossy = entry.rule.delivery == Delivery.LOSSY
-        self._spread = 1_000_000_000 if entry.rule.max_age is None else int(entry.rule.max_age * 1e8)  # nanoseconds
         self._spacing = SPACING[entry.rule.authenticity]
         self._sealer = sealer
         self._transport = transport
@@ -74,8 +70,7 @@ class Publisher:
         self._born = time.monotonic()
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
-        self._queue: deque[tuple[bytes, int]] = deque()  # with the time at which it was sent, nanoseconds since 1970
-        self._queued = 0
+        self._queue = Backlog(1_000_000_000 if entry.rule.max_age is None else int(entry.rule.max_age * 1e8))
         self._offers: deque[bytes] = deque(maxlen=64)
         self._asked: deque[int] = deque(maxlen=64)  # first sequence numbers for which we waited
         self._busy = False
@@ -174,21 +169,16 @@ class Publisher:
             raise failure
 
     def _enqueue(self, payload: bytes, sent: int, wait: float) -> None:
-        if self._lossy and self._queue:
-            self.superseded += len(self._queue)
-            self._queue.clear()
-            self._queued = 0
-
-        size = len(payload)
-        if not self._room(size):
-            self._wait_for_room(size, wait)
-        self._queue.append((payload, sent))
-        self._queued += size
+        if self._lossy:
+            self.superseded += self._queue.drop()
+        if not self._queue.room(len(payload)):
+            self._wait_for_room(len(payload), wait)
+        self._queue.add(payload, sent)
         if len(self._queue) == 1:  # else the worker knows that there is something to send
             self._changed.notify_all()
 
     def _wait_for_room(self, size: int, timeout: float) -> None:
-        if not self._wait(lambda: self._closing or self._room(size), timeout):
+        if not self._wait(lambda: self._closing or self._queue.room(size), timeout):
             self.congested += 1
             raise Congested(
                 f"the queue of {self.alias} is full ({len(self._queue)} messages): the network is slower than the sender; "
@@ -204,27 +194,9 @@ class Publisher:
         finally:
             self._waiting -= 1
 
-    def _room(self, size: int) -> bool:
-        return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._queued + size <= QUEUE_BYTES)
-
-    def _take(self) -> list[tuple[bytes, int]]:
-        """What goes out next: small messages together, a large one alone. A packet has the age of its oldest message."""
-        queue = self._queue
-        batch = [queue.popleft()]
-        size = len(batch[0][0])
-        until = batch[0][1] + self._spread
-        while queue and len(batch) < BATCH_MESSAGES:
-            payload, sent = queue[0]
-            if size + len(payload) > BATCH_BYTES or sent > until:
-                break
-            batch.append(queue.popleft())
-            size += len(payload)
-        self._queued -= size
-        return batch
-
     # -- sealing and sending; only whoever has set `_busy` does that -------------------------------------------------------
 
-    def _ship(self, batch: list[tuple[bytes, int]], now: float) -> None:
+    def _ship(self, batch: Batch, now: float) -> None:
         """Seal and send; without a key, back into the queue."""
         try:
             payload, sent = batch[0]
@@ -242,8 +214,7 @@ class Publisher:
             self.bytes += size
         except NoKey:
             with self._changed:
-                self._queue.extendleft(reversed(batch))
-                self._queued += sum(len(payload) for payload, _ in batch)
+                self._queue.put_back(batch)
                 self._free_at = time.monotonic() + FIRST_LIFE
             self._need_key()
         except TutelageError as error:  # for instance NotIssued: told to the next who sends
@@ -305,7 +276,7 @@ class Publisher:
                 return lambda: self._answer(offers)
             if not self._busy and self._queue and now >= self._free_at and not self._closing:
                 self._busy = True
-                batch = self._take()
+                batch = self._queue.take()
                 return lambda: self._ship(batch, now)
             if self._closing:
                 return None
