@@ -47,7 +47,7 @@ from tutelage.sgc.rules import Lane
 from tutelage.sgc.session import Handshake, Session, tags
 
 _SIGNATURE = 64
-_SMALL = 4096  # bytes up to which copying is cheaper than writing in place
+_SMALL = 16_384  # bytes up to which copying is cheaper than writing in place
 _LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys, certificate and policy
 
 
