@@ -142,6 +142,36 @@ def test_any_network_delivers_in_order_once_and_accounts_for_the_rest(data: st.D
     assert order.tally.lost == (max(got) if got else 0) - len(got)
 
 
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 30), st.integers(1, 6), st.sampled_from([SALT, SALT, OTHER])), max_size=30))
+def test_the_messages_of_a_packet_together_are_what_they_are_one_by_one(packets: list[tuple[int, int, bytes]]) -> None:
+    together, single = InOrder(0.0), InOrder(0.0)
+    for now, (first, count, salt) in enumerate(packets):
+        messages = [message(sequence, salt) for sequence in range(first, first + count)]
+        one_by_one = [ready for each in messages for ready in single.accept(each, now)]
+        assert together.accept_all(messages, now) == one_by_one
+        assert (together.tally, together.wake()) == (single.tally, single.wake())
+
+
+def test_a_packet_with_a_hole_is_no_run() -> None:
+    """Of a chain, what an anchor confirms may lack a message in the middle."""
+    order = InOrder(0.0)
+    assert numbers(order.accept_all([message(k) for k in (1, 2, 4)], 0.0)) == [1, 2]
+    assert order.wake() is not None
+    assert numbers(order.accept_all([message(3)], 0.0)) == [3, 4]
+    assert order.wake() is None
+
+
+def test_a_sender_that_starts_again_leaves_no_gap_behind() -> None:
+    order = InOrder(0.0)
+    order.accept(message(1), 0.0)
+    order.accept(message(3), 0.0)
+    assert order.wake() is not None
+    assert numbers(order.accept(message(1, OTHER), 1.0)) == [3, 1]
+    assert order.wake() is None
+    assert not order.crowded
+
+
 # -- frames -------------------------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import pytest
 from sgc.fleets import Fleet, eventually, service, topic
 
 from tutelage.errors import ConfigError
-from tutelage.sgc import lanes
+from tutelage.sgc import backlog, lanes
 from tutelage.sgc import publisher as publishing
 from tutelage.sgc.errors import NotAllowed, NotIssued
 from tutelage.sgc.history import make_request
@@ -176,6 +176,35 @@ def test_what_was_sent_while_the_network_was_down_is_replayed(network: Network, 
     assert subscription.repaired > 0
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_what_the_network_did_not_take_is_replayed(
+    arm: Node, server: Node, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    got = Received()
+    subscription = server.subscribe(f"log-{mode}", got)
+    log = arm.publisher(f"log-{mode}")
+    acquainted(log.send, got)
+    publish = arm.transport.publish
+
+    def congested(key: str, payload: bytes | bytearray, *, reliable: bool = True) -> None:
+        if key.endswith(lanes.STREAM):
+            raise Congested("for a moment")
+        publish(key, payload, reliable=reliable)
+
+    log.send(b"0")
+    log.flush(1.0)
+    monkeypatch.setattr(arm.transport, "publish", congested)
+    log.send(b"1")
+    log.flush(1.0)
+    monkeypatch.setattr(arm.transport, "publish", publish)
+    with pytest.raises(Congested, match="for a moment"):
+        log.send(b"not sent: the one before it failed")
+    log.send(b"2")
+    eventually(lambda: in_order(got, 3))
+    assert subscription.lost == 0
+    assert subscription.repaired > 0
+
+
 def test_the_last_message_is_not_missed_either(network: Network, arm: Node, server: Node) -> None:
     got = Received()
     server.subscribe("log-signature", got)
@@ -275,7 +304,7 @@ def test_a_busy_lossy_publisher_sends_the_newest(arm: Node, server: Node, monkey
 
 
 def test_a_network_that_takes_nothing_is_seen_by_the_sender(arm: Node, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publishing, "QUEUE_MESSAGES", 10)
+    monkeypatch.setattr(backlog, "QUEUE_MESSAGES", 10)
     log, gate = arm.publisher("log-signature"), threading.Event()
     stuck = threading.Event()
     monkeypatch.setattr(arm.transport, "publish", lambda *args, **options: stuck.set() or gate.wait(5.0))

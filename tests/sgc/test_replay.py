@@ -45,6 +45,20 @@ def test_the_window_agrees_with_a_set(batches: list[tuple[int, int]]) -> None:
             seen |= numbers
 
 
+def test_numbers_in_a_row_take_no_bits_until_the_row_ends() -> None:
+    window = Window()
+    for k in range(1, 3 * WINDOW, 500):
+        assert window.fresh(k, 500)
+        window.add(k, 500, 0)
+    assert not window._blocks
+    assert not window.fresh(window.highest, 1)
+    assert not window.fresh(window.highest - WINDOW + 1, 1)
+    window.add(window.highest + 2, 1, 0)
+    seen = window.highest - 2
+    assert window.fresh(window.highest - 1, 1)
+    assert not any(window.fresh(k, 1) for k in (seen, seen - 1024, window.highest - WINDOW + 1, window.highest))
+
+
 def test_messages_come_once_in_any_order_within_the_window() -> None:
     replay = Replay(None, START)
     assert [take(replay, k) for k in (3, 1, 2, WINDOW + 1)] == [None] * 4

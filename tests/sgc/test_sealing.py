@@ -49,7 +49,7 @@ def receive(opener: Opener, *packets) -> list[Opened]:
 
 
 @pytest.mark.parametrize(("alias", "sender", "receiver"), STREAMS)
-@pytest.mark.parametrize("size", [0, 1, 64, 1000, 3_000_000])
+@pytest.mark.parametrize("size", [0, 1, 64, 1000, 16_384, 16_385, 70_000, 3_000_000])
 def test_a_message_arrives_as_it_was_sent(fleet: Fleet, alias: str, sender: str, receiver: str, size: int) -> None:
     sealer, opener = fleet.pair(alias, sender, receiver)
     payload, before = bytes(range(256)) * (size // 256) + bytes(size % 256), time.time_ns()

@@ -14,10 +14,10 @@ from sgc import netlab
 from sgc.fleets import Fleet, Heard, Programs, eventually, free_port, service, topic
 
 from tutelage.sgc import lanes
+from tutelage.sgc.backlog import QUEUE_MESSAGES
 from tutelage.sgc.errors import NotAllowed
 from tutelage.sgc.names import Name, Topic
 from tutelage.sgc.node import Node
-from tutelage.sgc.publisher import QUEUE_MESSAGES
 from tutelage.sgc.router import Router, RouterConfig
 from tutelage.sgc.rules import Role
 from tutelage.sgc.transport.base import Congested

@@ -98,6 +98,10 @@ class Delivery(ABC):
     def accept(self, message: Opened, now: float) -> list[Opened]:
         """Take a message, with its frame; returns those that are to be delivered now."""
 
+    def accept_all(self, messages: list[Opened], now: float) -> list[Opened]:
+        """The same for all messages of a packet, of which there is at least one."""
+        return [ready for message in messages for ready in self.accept(message, now)]
+
     def due(self, now: float) -> list[Opened]:
         """What is to be delivered because time has passed."""
         return []
@@ -151,11 +155,21 @@ class Delivery(ABC):
 class InOrder(Delivery):
     """Every message, in order. What is missing is asked for, and given up only when the publisher cannot give it."""
 
+    def __init__(self, started: float, patience: float = PATIENCE, *, from_first_heard: bool = False) -> None:
+        super().__init__(started, patience, from_first_heard=from_first_heard)
+        self._gapped: dict[str, Stream] = {}  # those with a gap, by sender
+
+    def accept_all(self, messages: list[Opened], now: float) -> list[Opened]:
+        first, count = messages[0], len(messages)
+        known = self._current.get(first.sender)
+        if known is not None and first.sequence == known.next and first.salt == known.salt and not known.held:
+            after = known.next + count
+            if count == 1 or messages[-1].sequence == after - 1:
+                known.next = after
+                return messages  # as nearly always
+        return super().accept_all(messages, now)
+
     def accept(self, message: Opened, now: float) -> list[Opened]:
-        known = self._current.get(message.sender)
-        if known is not None and message.sequence == known.next and message.salt == known.salt and not known.held:
-            known.next += 1
-            return [message]  # as nearly all are
         stream, ready = self._stream(message, now)
         if stream is None or message.sequence < stream.next or message.sequence in stream.held:
             self.tally.late += 1
@@ -167,8 +181,9 @@ class InOrder(Delivery):
         stream.held[message.sequence] = message
         stream.size += len(message.payload)
         if stream.since is None:
-            stream.since, stream.ask_at, stream.pause = now, now + FIRST_ASK, ASK_AGAIN
+            stream.ask_at, stream.pause = now + FIRST_ASK, ASK_AGAIN
             self.tally.gaps += 1
+            self._wait(stream, now)
         ready += self._advance(stream, now)
         while len(stream.held) > HELD_MESSAGES or stream.size > HELD_BYTES:
             ready += self._skip(stream, min(stream.held), now)
@@ -176,14 +191,13 @@ class InOrder(Delivery):
 
     @property
     def crowded(self) -> bool:
-        for stream in tuple(self._current.values()):
-            if len(stream.held) > HELD_MESSAGES // 2 or stream.size > HELD_BYTES // 2:
-                return True
-        return False
+        return bool(self._gapped) and any(
+            len(stream.held) > HELD_MESSAGES // 2 or stream.size > HELD_BYTES // 2 for stream in tuple(self._gapped.values())
+        )
 
     def due(self, now: float) -> list[Opened]:
         ready: list[Opened] = []
-        for stream in self._current.values():
+        for stream in tuple(self._gapped.values()):
             if stream.since is not None and now - stream.since >= stream.patience:
                 stream.patience = min(stream.patience, IMPATIENCE)
                 ready += self._release_all(stream, now)
@@ -191,16 +205,16 @@ class InOrder(Delivery):
 
     def questions(self, now: float) -> list[tuple[bytes, list[tuple[int, int]]]]:
         asked = []
-        for stream in self._current.values():
-            if stream.since is not None and now >= stream.ask_at:
+        for stream in self._gapped.values():
+            if now >= stream.ask_at:
                 stream.asked, stream.ask_at = stream.next, now + PATIENCE  # until `answered`
                 asked.append((stream.salt, _gaps(stream)))
         return asked
 
     def answered(self, salt: bytes, floor: int, now: float, *, in_vain: bool = False) -> list[Opened]:
         ready: list[Opened] = []
-        for stream in self._current.values():
-            if stream.salt == salt and stream.since is not None:
+        for stream in tuple(self._gapped.values()):
+            if stream.salt == salt:
                 if in_vain and stream.next == stream.asked:
                     floor = min(stream.held)
                 if floor > stream.next:
@@ -212,8 +226,18 @@ class InOrder(Delivery):
         return ready
 
     def wake(self) -> float | None:
-        times = [min(s.ask_at, s.since + s.patience) for s in self._current.values() if s.since is not None]
-        return min(times, default=None)
+        if not self._gapped:
+            return None
+        waiting = [(stream, stream.since) for stream in tuple(self._gapped.values())]
+        return min((min(s.ask_at, since + s.patience) for s, since in waiting if since is not None), default=None)
+
+    def _wait(self, stream: Stream, since: float | None) -> None:
+        """A stream has a gap and no progress since then; None: it has none any more."""
+        stream.since = since
+        if since is not None:
+            self._gapped[stream.sender] = stream
+        else:
+            self._gapped.pop(stream.sender, None)
 
     def _advance(self, stream: Stream, now: float) -> list[Opened]:
         """What is next in turn among those held."""
@@ -223,9 +247,9 @@ class InOrder(Delivery):
             stream.next += 1
             ready.append(message)
         if not stream.held:
-            stream.since = None
+            self._wait(stream, None)
         elif ready:
-            stream.since = now
+            self._wait(stream, now)
         return ready
 
     def _skip(self, stream: Stream, to: int, now: float) -> list[Opened]:
@@ -236,7 +260,7 @@ class InOrder(Delivery):
             self.tally.lost += first - stream.next
             stream.next = first
             ready += self._advance(stream, now)
-        stream.since = now if stream.held else None
+        self._wait(stream, now if stream.held else None)
         return ready
 
     def _release_all(self, stream: Stream, now: float) -> list[Opened]:

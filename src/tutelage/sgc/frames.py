@@ -31,7 +31,7 @@ class Kind(IntEnum):
     LIFE = 2  # nothing but a sequence number: shows that the sender lives and what it has sent so far
 
 
-_WHOLE = bytes([Kind.WHOLE])
+_WHOLE = int(Kind.WHOLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class Assembly:
         Raises:
             Refused: MALFORMED.
         """
-        if not self._parts and payload[:1] == _WHOLE and len(payload) >= _HEAD.size:  # as nearly all are
+        if not self._parts and len(payload) >= _HEAD.size and payload[0] == _WHOLE:  # as nearly all are
             return payload[_HEAD.size :]
         return self.add(sequence, parse(payload))
 

@@ -33,17 +33,17 @@ def counters(node: Node) -> Tree:
     for subscription in node.subscriptions():
         tally = subscription.delivery.tally
         mine = {
-            "received": subscription.received,
+            "received": subscription.outlet.received,
             "packets": subscription.packets,
-            "bytes": subscription.bytes,
+            "bytes": subscription.outlet.bytes,
             "queued": subscription.queued,
             "lost": tally.lost,
             "gaps": tally.gaps,
             "late": tally.late,
             "repaired": subscription.repaired,
             "deferred": subscription.deferred,
-            "superseded": subscription.superseded,
-            "failed": subscription.failed,
+            "superseded": subscription.outlet.superseded,
+            "failed": subscription.outlet.failed,
             "refused": subscription.opener.refusals.as_dict(),
             "latency": dict(subscription.latency),
         }

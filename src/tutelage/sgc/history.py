@@ -39,7 +39,7 @@ class History:
             packets, size: how many packets and bytes are kept; the newest packet always is.
             max_age: seconds after which a packet is worthless, None: never.
         """
-        self._limit, self._size, self._max_age = packets, size, max_age
+        self._limit, self._size, self._max_age = packets, size, float("inf") if max_age is None else max_age
         self._lock = threading.Lock()
         self._packets: deque[_Kept] = deque()
         self._held = 0
@@ -53,15 +53,15 @@ class History:
         confirms: without this one, those before it are worth nothing to the receiver (an anchor of a chain).
         """
         with self._lock:
-            self._packets.append((last, first, now, packet, confirms))
-            self._confirms |= confirms
+            kept = self._packets
+            kept.append((last, first, now, packet, confirms))
             self._held += len(packet)
-            while len(self._packets) > 1 and (
-                len(self._packets) > self._limit
-                or self._held > self._size
-                or (self._max_age is not None and now - self._packets[0][2] > self._max_age)
-            ):
-                self._held -= len(self._packets.popleft()[3])
+            if confirms:
+                self._confirms = True
+            while len(kept) > self._limit or self._held > self._size or now - kept[0][2] > self._max_age:
+                if len(kept) == 1:
+                    break
+                self._held -= len(kept.popleft()[3])
 
     def find(self, ranges: Iterable[tuple[int, int]], size: int = ANSWER) -> tuple[int, list[bytes | bytearray]]:
         """The lowest sequence number kept, and the packets with messages in the ranges, oldest first, up to `size` bytes.

@@ -20,29 +20,35 @@ from tutelage.sgc.packet import (
     BARE_PROOF,
     BATCH,
     BODY,
+    CHAIN,
     HEADER,
     INTRODUCTION,
+    MAX_PACKET,
     MODES,
     PROOF,
-    SENDER,
-    START,
-    STREAM,
+    SESSION,
+    SESSION_ID,
+    SIGNATURE,
+    SLOT,
+    TAG,
     Buffer,
-    Header,
     Opened,
     Statements,
     message_key,
     nonce,
     read_header,
+    read_layout,
+    read_stream,
     split_batch,
 )
 from tutelage.sgc.reasons import Reason, Refusals, Refused
 from tutelage.sgc.replay import MAX_SENDERS, Replay
-from tutelage.sgc.rules import Authenticity, Lane, Role
-from tutelage.sgc.session import Handshake, Session, slots
+from tutelage.sgc.rules import Lane, Role
+from tutelage.sgc.session import Handshake, Session
 from tutelage.sgc.trust import Member
 
 _LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys and policy
+_NEVER = -1
 _MAX_STREAMS = 1024
 _MAX_SESSIONS = 1024
 
@@ -75,18 +81,18 @@ class Opener:
         self._authenticity = self._entry.rule.authenticity_on(lane)
         self._mode = MODES[self._authenticity]
         self._name = bytes(self._entry.name)
-        self._provisional = provisional
+        self._authentic = self._mode != CHAIN or not provisional  # are messages when `_open` gives them
         self._statements = Statements(self._name, lane)
         self._replay = Replay(self._entry.rule.max_age, time.time_ns())
         self._confirmation = Confirmation(self._statements, self.refusals, provisional=provisional)
         self._handshake = Handshake(self._home, self._entry, lane)
         self._lock = threading.RLock()
-        self._looked = 0
+        self._looked = self._look_at = 0
         self._versions = (-1, -1)
         self._look_count = 0
         self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
         self._members: OrderedDict[bytes, Member] = OrderedDict()
-        self._sessions: OrderedDict[tuple[bytes, bytes, bytes], Session] = OrderedDict()
+        self._sessions: OrderedDict[bytes, Session] = OrderedDict()  # by sender, salt and id
 
     def open(self, packet: Buffer, *, bind: bytes = b"", now: int | None = None) -> Opened:
         """The one message of a packet.
@@ -133,46 +139,64 @@ class Opener:
         with self._lock:
             with self.refusals.counting():
                 sender, salt, session = self._handshake.complete(answer)
-            self._sessions[sender, salt, session.ident] = session
+            self._sessions[sender + salt + session.ident] = session
             while len(self._sessions) > _MAX_SESSIONS:
                 self._sessions.popitem(last=False)
             return session.member.node
 
     def _open(self, packet: memoryview, bind: bytes, now: int) -> list[Opened]:
-        header = read_header(packet, self._mode)
+        size = len(packet)
+        if size > MAX_PACKET:
+            raise Refused(Reason.OVERSIZE, f"a packet of {size} bytes; {MAX_PACKET} are allowed")
+        if size < HEADER + TAG:
+            raise Refused(Reason.MALFORMED, f"a packet of {size} bytes")
         raw = bytes(packet[:HEADER])
-        bare = header.flags & BARE
-        if not bare:
-            self._replay.check(header.sender, header.salt, header.first, header.sent, now)  # cheap, so first
-        stream = self._stream(header, raw, now)
-        start, end = HEADER + header.introduction, len(packet) - header.proof
-        if bare:
+        layout, name, first, sent = read_header(raw)
+        flags, introduction, proof = read_layout(layout, self._mode)
+        start, end = HEADER + introduction, size - proof
+        if first == 0 or start + TAG > end:
+            raise Refused(Reason.MALFORMED, "a packet with an impossible header")
+        stream = self._streams.get(name) or _Stream(name)  # of a new one nothing is kept yet: anybody can make up a salt
+        if not flags & BARE:
+            self._replay.check(stream.sender, stream.salt, first, sent, now)  # cheap, so first
+        if not self._looked <= now <= self._look_at or self._versions != (self._keyring.version, self._home.version):
+            self._look(now)
+        if stream.look != self._look_count:
+            self._look_at_stream(stream, introduction > 0, now)
+        if flags & BARE:
             _decrypt(stream.cipher, BARE_BODY, packet[start:end], raw)
-            member = self._member(stream, header, raw, packet[HEADER:start], now)
-            return self._anchor(stream, BARE_PROOF, header, raw, packet[end:], member, now)
+            member = self._member(stream, raw, packet[HEADER:start], now)
+            return self._anchor(stream, BARE_PROOF, raw, packet[end:], member, now)
         body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
-        if self._authenticity == Authenticity.SESSION:
-            member = self._session_member(stream, header, raw, packet, end, now)
+        if self._mode == SESSION:
+            member = self._session_member(stream, raw, packet, end, now)
         else:
-            member = self._member(stream, header, raw, packet[HEADER:start], now)
-        messages = self._messages(header, raw, member, body)
-        if self._authenticity == Authenticity.CHAIN:
-            return self._chained(stream, header, raw, bind, body, packet[end:], member, messages, now)
-        if self._authenticity == Authenticity.SIGNATURE:
+            member = self._member(stream, raw, packet[HEADER:start], now)
+        epoch, salt, authentic, began = stream.epoch, stream.salt, self._authentic, stream.start
+        if flags & BATCH:
+            messages = [
+                Opened(part, member.node, sequence, salt, sent, epoch, authentic, began)
+                for sequence, part in enumerate(split_batch(body), first)
+            ]
+        else:
+            messages = [Opened(body, member.node, first, salt, sent, epoch, authentic, began)]
+        if self._mode == CHAIN:
+            return self._chained(stream, flags, raw, bind, body, packet[end:], member, messages, now)
+        if self._mode == SIGNATURE:
             signature = _decrypt(stream.cipher, PROOF, packet[end:], raw)
             try:
                 member.signing.verify(signature, self._statements.message(raw, bind, body))
             except InvalidSignature:
                 raise Refused(Reason.FORGED, f"a message of {self.alias} that {member.node} did not sign") from None
-        self._replay.admit(header.sender, header.salt, header.first, len(messages), header.sent)
+        self._replay.admit(stream.sender, salt, first, len(messages), sent)
         if stream.member is not member:
-            self._remember(stream, raw, member)
+            self._remember(stream, member)
         return messages
 
     def _chained(
         self,
         stream: _Stream,
-        header: Header,
+        flags: int,
         raw: bytes,
         bind: bytes,
         body: bytes,
@@ -181,99 +205,73 @@ class Opener:
         messages: list[Opened],
         now: int,
     ) -> list[Opened]:
-        statement = self._statements.message(raw, bind, body)
+        statement, first = self._statements.message(raw, bind, body), messages[0].sequence
         with self._lock:
-            ready = self._confirmation.message(
-                (header.sender, header.salt), header.first, statement, messages, len(body), now
-            )
+            ready = self._confirmation.message((stream.sender, stream.salt), first, statement, messages, len(body), now)
         if ready is not None:
-            self._replay.admit(header.sender, header.salt, header.first, len(ready), header.sent)
+            self._replay.admit(stream.sender, stream.salt, first, len(ready), messages[0].sent)
         if stream.member is not member:
-            self._remember(stream, raw, member)
-        if header.flags & ANCHOR:
-            return (ready or []) + self._anchor(stream, PROOF, header, raw, proof, member, now)
+            self._remember(stream, member)
+        if flags & ANCHOR:
+            return (ready or []) + self._anchor(stream, PROOF, raw, proof, member, now)
         return ready or []
 
     def _anchor(
-        self, stream: _Stream, purpose: int, header: Header, raw: bytes, proof: memoryview, member: Member, now: int
+        self, stream: _Stream, purpose: bytes, raw: bytes, proof: memoryview, member: Member, now: int
     ) -> list[Opened]:
         anchor = _decrypt(stream.cipher, purpose, proof, raw)
 
         def admit(first: int, messages: list[Opened]) -> None:
             self._replay.check_time(messages[0].sent, now)
-            self._replay.admit(header.sender, header.salt, first, len(messages), messages[0].sent)
+            self._replay.admit(stream.sender, stream.salt, first, len(messages), messages[0].sent)
 
         with self._lock:
-            return self._confirmation.anchor((header.sender, header.salt), anchor, member.signing, admit)
+            return self._confirmation.anchor((stream.sender, stream.salt), anchor, member.signing, admit)
 
-    def _messages(self, header: Header, raw: bytes, member: Member, body: bytes) -> list[Opened]:
-        authentic = self._authenticity != Authenticity.CHAIN or not self._provisional
-        node, first, salt, sent, epoch = member.node, header.first, header.salt, header.sent, header.epoch
-        stream = raw[START]
-        if not header.flags & BATCH:
-            return [Opened(body, node, first, salt, sent, epoch, authentic, stream)]
-        return [
-            Opened(part, node, sequence, salt, sent, epoch, authentic, stream)
-            for sequence, part in enumerate(split_batch(body), first)
-        ]
-
-    def _stream(self, header: Header, raw: bytes, now: int) -> _Stream:
-        """What is known of the packet's stream; of a new one nothing is kept yet, as anybody can make up a salt.
-
-        Looks from time to time, and at every change: is the epoch accepted, may the sender still send, may we receive?
-        """
-        if (
-            now - self._looked > _LOOK_EVERY
-            or now < self._looked
-            or self._versions != (self._keyring.version, self._home.version)
-        ):
-            self._look(now)
-        stream = self._streams.get(raw[STREAM])
-        if stream is not None and stream.look == self._look_count:
-            return stream
-        key = self._keyring.opening(self.alias, header.epoch, now / 1e9).key
-        if stream is None:
-            cipher = message_key(key, self._name, self.lane, header.epoch, header.sender, header.salt)
-            return _Stream(AESGCM(cipher), self._look_count)
-        if stream.member is not None and not header.introduction:
+    def _look_at_stream(self, stream: _Stream, introduced: bool, now: int) -> None:
+        """Is its epoch accepted, may its sender still send? To be asked after each look."""
+        key = self._keyring.opening(self.alias, stream.epoch, now / 1e9).key
+        if stream.look == _NEVER:
+            stream.cipher = AESGCM(message_key(key, self._name, self.lane, stream.epoch, stream.sender, stream.salt))
+        elif stream.member is not None and not introduced:
             self._check(stream.member, now)
         stream.look = self._look_count
-        return stream
 
-    def _remember(self, stream: _Stream, raw: bytes, member: Member) -> None:
+    def _remember(self, stream: _Stream, member: Member) -> None:
         """Keep what an authentic packet taught."""
         with self._lock:
             stream.member = member
-            self._streams[raw[STREAM]] = stream
+            self._streams[stream.name] = stream
             while len(self._streams) > _MAX_STREAMS:
                 self._streams.popitem(last=False)
-            if self._authenticity != Authenticity.SESSION:
-                self._members[raw[SENDER]] = member
+            if self._mode != SESSION:
+                self._members[stream.sender] = member
                 while len(self._members) > MAX_SENDERS:
                     self._members.popitem(last=False)
 
-    def _member(self, stream: _Stream, header: Header, raw: bytes, introduction: memoryview, now: int) -> Member:
+    def _member(self, stream: _Stream, raw: bytes, introduction: memoryview, now: int) -> Member:
         """Who the sender is, from its introduction or an earlier one; it may send, now."""
-        if header.introduction:
+        if introduction:
             member = self._home.trust.read(_decrypt(stream.cipher, INTRODUCTION, introduction, raw))
-            if self._id_of(member) != header.sender:
+            if self._id_of(member) != stream.sender:
                 raise Refused(Reason.FORGED, f"a packet of {self.alias} with the credential of another, {member.node}")
         elif stream.member is not None:
-            return stream.member  # `_stream` has checked it
+            return stream.member  # `_look_at_stream` has checked it
         else:
-            found = self._members.get(header.sender) or self._from_keyring(header.sender)
+            found = self._members.get(stream.sender) or self._from_keyring(stream.sender)
             if found is None:
                 raise Refused(Reason.UNKNOWN_SENDER, f"a packet of {self.alias} by a sender that is not introduced yet")
             member = found
         self._check(member, now)
         return member
 
-    def _session_member(self, stream: _Stream, header: Header, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
-        for ident, tag in slots(packet[end:]):
-            session = self._sessions.get((header.sender, header.salt, ident))
-            if session is not None and now / 1e9 < session.until:
-                session.check(raw, packet[:end], tag)
-                if session.member is not stream.member:  # else `_stream` has checked it
+    def _session_member(self, stream: _Stream, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
+        """Who the sender is, from the tag that it made for us."""
+        for at in range(end, len(packet), SLOT):
+            session = self._sessions.get(stream.start + packet[at : at + SESSION_ID])
+            if session is not None and now < session.until:
+                session.check(raw, packet[:end], packet[at + SESSION_ID : at + SLOT])
+                if session.member is not stream.member:  # else `_look_at_stream` has checked it
                     self._check(session.member, now)
                 return session.member
         raise Refused(Reason.NO_SESSION, f"a packet of {self.alias} by a sender with whom no session is open")
@@ -297,7 +295,7 @@ class Opener:
                 if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:
                     raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
                 self._replay.set_max_age(self._entry.rule.max_age)
-            self._versions, self._looked = versions, now
+            self._versions, self._looked, self._look_at = versions, now, now + _LOOK_EVERY
             self._look_count += 1
 
 
@@ -305,19 +303,26 @@ class _Stream:
     """One start of one sender under one epoch.
 
     Attributes:
-        cipher: of its packets.
+        name: epoch, sender and salt, as in a header.
+        start: sender and salt.
+        cipher: of its packets; not there before the first look.
         look: when it was last checked, in looks.
         member: who it is; None before the first authentic packet.
     """
 
-    __slots__ = ("cipher", "look", "member")
+    __slots__ = ("cipher", "epoch", "look", "member", "name", "salt", "sender", "start")
 
-    def __init__(self, cipher: AESGCM, look: int) -> None:
-        self.cipher, self.look = cipher, look
+    cipher: AESGCM
+
+    def __init__(self, name: bytes) -> None:
+        self.name = name
+        self.epoch, self.sender, self.salt = read_stream(name)
+        self.start: bytes = self.sender + self.salt
+        self.look = _NEVER
         self.member: Member | None = None
 
 
-def _decrypt(cipher: AESGCM, purpose: int, sealed: memoryview, associated: bytes) -> bytes:
+def _decrypt(cipher: AESGCM, purpose: bytes, sealed: memoryview, associated: bytes) -> bytes:
     try:
         return cipher.decrypt(nonce(purpose, associated), sealed, associated)
     except InvalidTag:

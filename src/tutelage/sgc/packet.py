@@ -16,6 +16,7 @@ import os
 import struct
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -35,14 +36,18 @@ MAX_PART = 65_535
 TAG = 16
 SALT_BYTES = 16
 VERSION = 1
-MODES = {Authenticity.SIGNATURE: 1, Authenticity.SESSION: 2, Authenticity.CHAIN: 3}
+SIGNATURE, SESSION, CHAIN = 1, 2, 3
+MODES = {Authenticity.SIGNATURE: SIGNATURE, Authenticity.SESSION: SESSION, Authenticity.CHAIN: CHAIN}
 _HEADER = struct.Struct(">BBHHHI16s16sQQ")
+_LAYOUT = struct.Struct(">BBHHH")
+_STREAM = struct.Struct(">I16s16s")
 HEADER = _HEADER.size
 _FLAGS = 3
-STREAM, SENDER, IDENT = slice(8, 44), slice(12, 28), slice(12, 52)
-"""Parts of a header: epoch, sender and salt; sender; sender, salt and sequence."""
-START = slice(12, 44)
-"""Sender and salt."""
+_IDENT, _SEQUENCE = slice(12, 52), slice(44, 52)
+SESSION_ID = 8
+SLOT = SESSION_ID + TAG
+"""Bytes of a session in a proof: its id, and a tag."""
+MAX_SESSIONS = 16
 MAX_PACKET = HEADER + MAX_PAYLOAD + 4 * (MAX_BATCH + 1) + TAG + 2 * MAX_PART
 _CONTEXT = b"tutelage message 1"
 _CHUNK = 1 << 20
@@ -51,55 +56,50 @@ _COUNT = struct.Struct(">I")
 BATCH, ANCHOR, BARE = 1, 2, 4
 """Flags: the body holds many messages; the proof confirms earlier ones too; there is no message, only a proof."""
 
-BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG = range(6)
+BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG = (purpose.to_bytes(4, "big") for purpose in range(6))
 """What a nonce is for: the first 4 of its 12 bytes, so that one sequence number serves several without repetition."""
-_PURPOSES = [purpose.to_bytes(4, "big") for purpose in range(6)]
 
 
-class Header(NamedTuple):
-    """Fields of a header."""
+class Layout(NamedTuple):
+    """What the first bytes of a packet say of the rest: its flags, and the lengths of introduction and proof."""
 
-    version: int
-    mode: int
     flags: int
     introduction: int
     proof: int
-    epoch: int
-    sender: bytes
-    salt: bytes
-    first: int
-    sent: int
 
 
 make_header = _HEADER.pack
-"""The fields of `Header` as bytes."""
+"""The fields of a header as bytes: all that the table above names, in its order."""
+
+read_header = struct.Struct(">8s36sQQ").unpack
+"""The layout in 8 bytes, the stream in 36, and two numbers: sequence and time of sending."""
+
+read_stream = _STREAM.unpack
+"""Epoch, sender and salt."""
 
 
-def read_header(packet: memoryview, mode: int) -> Header:
-    """The header of a packet, if it is one of ours of this mode.
+@lru_cache(256)
+def read_layout(start: bytes, mode: int) -> Layout:
+    """Read the layout of a packet, if it is one of ours of this mode. Most packets begin alike.
 
     Raises:
-        Refused: MALFORMED, OVERSIZE or WRONG_MODE.
+        Refused: MALFORMED or WRONG_MODE.
     """
-    if len(packet) > MAX_PACKET:
-        raise Refused(Reason.OVERSIZE, f"a packet of {len(packet)} bytes; {MAX_PACKET} are allowed")
-    if len(packet) < HEADER + TAG:
-        raise Refused(Reason.MALFORMED, f"a packet of {len(packet)} bytes")
-    header = Header._make(_HEADER.unpack_from(packet))
-    if header.version != VERSION:
-        raise Refused(Reason.MALFORMED, f"a packet of version {header.version}; this is version {VERSION}")
-    if header.mode != mode:
-        raise Refused(Reason.WRONG_MODE, f"authenticity {header.mode}, and the policy says {mode}")
-    if header.flags > 7 or header.first == 0 or header.introduction + header.proof > len(packet) - HEADER - TAG:
-        raise Refused(Reason.MALFORMED, "a packet with an impossible header")
-    if bool(header.flags & (ANCHOR | BARE)) and (mode != MODES[Authenticity.CHAIN] or not header.flags & ANCHOR):
+    version, found, flags, introduction, proof = _LAYOUT.unpack(start)
+    if version != VERSION:
+        raise Refused(Reason.MALFORMED, f"a packet of version {version}; this is version {VERSION}")
+    if found != mode:
+        raise Refused(Reason.WRONG_MODE, f"authenticity {found}, and the policy says {mode}")
+    if flags > 7 or (flags & (ANCHOR | BARE) and (mode != CHAIN or not flags & ANCHOR)):
         raise Refused(Reason.MALFORMED, "a packet with flags of another mode")
-    return header
+    if mode == SESSION and (proof % SLOT or proof > SLOT * MAX_SESSIONS):
+        raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
+    return Layout(flags, introduction, proof)
 
 
 def ident(packet: Buffer) -> bytes:
     """40 bytes that identify a packet: sender, salt and sequence. A reply binds to that of its request."""
-    return bytes(memoryview(packet)[IDENT])
+    return bytes(memoryview(packet)[_IDENT])
 
 
 def anchored(packet: Buffer) -> bool:
@@ -107,10 +107,10 @@ def anchored(packet: Buffer) -> bool:
     return bool(packet[_FLAGS] & ANCHOR)
 
 
-def nonce(purpose: int, header: bytes) -> bytes:
+def nonce(purpose: bytes, header: bytes) -> bytes:
     """12 bytes that never repeat under one key: what for, and the sequence number in a header. Keys differ by salt, and a
     salt is never used twice."""
-    return _PURPOSES[purpose] + header[44:52]
+    return purpose + header[_SEQUENCE]
 
 
 def message_key(epoch_key: bytes, name: bytes, lane: Lane, epoch: int, sender: bytes, salt: bytes) -> bytes:

@@ -17,6 +17,7 @@ from typing import Self
 from tutelage.errors import ConfigError, TutelageError
 from tutelage.sgc import frames, lanes
 from tutelage.sgc.access import Authenticity, Delivery, Entry
+from tutelage.sgc.backlog import Backlog, Batch
 from tutelage.sgc.errors import NoKey
 from tutelage.sgc.history import History, parse_request
 from tutelage.sgc.packet import anchored
@@ -26,10 +27,8 @@ from tutelage.sgc.transport.base import Congested, Transport
 
 log = logging.getLogger(__name__)
 
-QUEUE_MESSAGES = 1024
-QUEUE_BYTES = 64 << 20
-BATCH_MESSAGES = 256
-BATCH_BYTES = 128 << 10
+_WHOLE = frames.Kind.WHOLE
+
 INLINE = 16 << 10
 """Bytes of the largest message that is sealed in the caller's thread: so much the system's own buffers always take."""
 
@@ -61,10 +60,8 @@ class Publisher:
         self.sent = self.packets = self.bytes = self.congested = self.superseded = self.answered = 0
         self._rule = entry.rule
         self._lossy = entry.rule.delivery == Delivery.LOSSY
-        self._spread = 1_000_000_000 if entry.rule.max_age is None else int(entry.rule.max_age * 1e8)  # nanoseconds
         self._spacing = SPACING[entry.rule.authenticity]
         self._sealer = sealer
-        self._sealing = threading.Lock()
         self._transport = transport
         self._need_key = need_key
         self._key = lanes.key(entry.name, lanes.STREAM)
@@ -73,8 +70,7 @@ class Publisher:
         self._born = time.monotonic()
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
-        self._queue: deque[tuple[bytes, int]] = deque()  # with the time at which it was sent, nanoseconds since 1970
-        self._queued = 0
+        self._queue = Backlog(1_000_000_000 if entry.rule.max_age is None else int(entry.rule.max_age * 1e8))
         self._offers: deque[bytes] = deque(maxlen=64)
         self._asked: deque[int] = deque(maxlen=64)  # first sequence numbers for which we waited
         self._busy = False
@@ -86,6 +82,7 @@ class Publisher:
         session = entry.rule.authenticity == Authenticity.SESSION
         self._life_at = self._born if session else float("inf")  # receivers without a session learn that we are there
         self._pause = FIRST_LIFE
+        self._first_life = float("inf") if self._lossy else FIRST_LIFE
         self._anchor_every: float = getattr(sealer, "anchor_every", 0.02)
         self._chain = entry.rule.authenticity == Authenticity.CHAIN
         self._anchor_at = float("inf")
@@ -110,19 +107,20 @@ class Publisher:
             ConfigError: the message is too large, or the publisher is closed.
             NotIssued: the node's certificate has expired.
         """
-        if len(payload) > frames.MAX_MESSAGE:
-            raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {len(payload):,} bytes")
-        sent = time.time_ns()
+        size = len(payload)
+        if size > frames.MAX_MESSAGE:
+            raise ConfigError(f"a message has at most {frames.MAX_MESSAGE >> 20} MiB, not {size:,} bytes")
+        sent, now = time.time_ns(), time.monotonic()
         with self._lock:
-            self._check()
-            alone = not self._busy and not self._queue and len(payload) <= INLINE and time.monotonic() >= self._free_at
+            if self._closing or self._failure is not None:
+                self._check()
+            alone = size <= INLINE and not self._queue and not self._busy and now >= self._free_at
             if alone:
                 self._busy = True
             else:
                 self._enqueue(bytes(payload), sent, wait)
         if alone:
-            batch = [(payload if isinstance(payload, bytes) else bytes(payload), sent)]
-            self._ship(batch)
+            self._ship([(bytes(payload), sent)], now)
 
     def flush(self, timeout: float) -> bool:
         """Wait until everything queued has been handed to the transport; False: it was not within `timeout` seconds."""
@@ -171,23 +169,22 @@ class Publisher:
             raise failure
 
     def _enqueue(self, payload: bytes, sent: int, wait: float) -> None:
-        if self._lossy and self._queue:
-            self.superseded += len(self._queue)
-            self._queue.clear()
-            self._queued = 0
+        if self._lossy:
+            self.superseded += self._queue.drop()
+        if not self._queue.room(len(payload)):
+            self._wait_for_room(len(payload), wait)
+        self._queue.add(payload, sent)
+        if len(self._queue) == 1:  # else the worker knows that there is something to send
+            self._changed.notify_all()
 
-        size = len(payload)
-        if not self._room(size) and not self._wait(lambda: self._closing or self._room(size), wait):
+    def _wait_for_room(self, size: int, timeout: float) -> None:
+        if not self._wait(lambda: self._closing or self._queue.room(size), timeout):
             self.congested += 1
             raise Congested(
                 f"the queue of {self.alias} is full ({len(self._queue)} messages): the network is slower than the sender; "
                 "send less, or use a lossy topic"
             )
         self._check()
-        self._queue.append((payload, sent))
-        self._queued += size
-        if len(self._queue) == 1:  # else the worker knows that there is something to send
-            self._changed.notify_all()
 
     def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
         """Until the worker or whoever sends has brought it about."""
@@ -197,43 +194,27 @@ class Publisher:
         finally:
             self._waiting -= 1
 
-    def _room(self, size: int) -> bool:
-        return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._queued + size <= QUEUE_BYTES)
+    # -- sealing and sending; only whoever has set `_busy` does that -------------------------------------------------------
 
-    def _take(self) -> list[tuple[bytes, int]]:
-        """What goes out next: small messages together, a large one alone. A packet has the age of its oldest message."""
-        batch = [self._queue.popleft()]
-        size = len(batch[0][0])
-        until = batch[0][1] + self._spread
-        while (
-            self._queue
-            and len(batch) < BATCH_MESSAGES
-            and size + len(self._queue[0][0]) <= BATCH_BYTES
-            and self._queue[0][1] <= until
-        ):
-            batch.append(self._queue.popleft())
-            size += len(batch[-1][0])
-        self._queued -= size
-        return batch
-
-    # -- sealing and sending; `_busy` is set -------------------------------------------------------------------------------
-
-    def _ship(self, batch: list[tuple[bytes, int]]) -> None:
+    def _ship(self, batch: Batch, now: float) -> None:
         """Seal and send; without a key, back into the queue."""
         try:
-            age = time.monotonic() - self._born
-            if len(batch) == 1 and len(batch[0][0]) > frames.PIECE:
-                for piece in frames.pieces(memoryview(batch[0][0]), age):
-                    self._publish([piece], batch[0][1])
+            payload, sent = batch[0]
+            size = len(payload)
+            if len(batch) > 1:
+                head = frames.head(_WHOLE, now - self._born)
+                self._publish([head + payload for payload, _ in batch], sent, now)
+                size = sum([len(payload) for payload, _ in batch])
+            elif size <= frames.PIECE:
+                self._publish([frames.head(_WHOLE, now - self._born) + payload], sent, now)
             else:
-                head = frames.head(frames.Kind.WHOLE, age)
-                self._publish([head + payload for payload, _ in batch], batch[0][1])
+                for piece in frames.pieces(memoryview(payload), now - self._born):
+                    self._publish([piece], sent, now)
             self.sent += len(batch)
-            self.bytes += len(batch[0][0]) if len(batch) == 1 else sum(len(payload) for payload, _ in batch)
+            self.bytes += size
         except NoKey:
             with self._changed:
-                self._queue.extendleft(reversed(batch))
-                self._queued += sum(len(payload) for payload, _ in batch)
+                self._queue.put_back(batch)
                 self._free_at = time.monotonic() + FIRST_LIFE
             self._need_key()
         except TutelageError as error:  # for instance NotIssued: told to the next who sends
@@ -246,29 +227,29 @@ class Publisher:
         with self._lock:
             self._busy = False
             self._free_at = max(self._free_at, now + self._spacing)
-            self._pause = FIRST_LIFE
-            self._life_at = now + FIRST_LIFE if not self._lossy else float("inf")
+            self._pause, self._life_at = FIRST_LIFE, now + self._first_life
             if self._chain:
                 self._anchor_at = min(self._anchor_at, now + self._anchor_every)
             # The worker is woken only if it must do something sooner than it thinks: a wake costs more than a small message.
-            if self._queue or self._waiting or min(self._life_at, self._anchor_at) < self._wakes_at:
+            wakes_at = self._wakes_at
+            if self._queue or self._waiting or self._life_at < wakes_at or self._anchor_at < wakes_at:
                 self._changed.notify_all()
 
-    def _publish(self, payloads: list[bytes], sent: int) -> None:
-        with self._sealing:
-            before = self._sealer.sequence
-            if len(payloads) == 1:
-                packet = self._sealer.seal(payloads[0], now=sent)
-            else:
-                packet = self._sealer.seal_many(payloads, now=sent)
-            self._hand_over(before + 1, packet)
+    def _publish(self, payloads: list[bytes], sent: int, now: float) -> None:
+        if len(payloads) == 1:
+            self._hand_over(1, self._sealer.seal(payloads[0], now=sent), now)
+        else:
+            self._hand_over(len(payloads), self._sealer.seal_many(payloads, now=sent), now)
 
-    def _hand_over(self, first: int, packet: bytes | bytearray) -> None:
-        if not self._lossy:
-            last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
-            self._history.add(min(first, last), last, packet, time.monotonic(), confirms=self._chain and anchored(packet))
-        self.packets += 1
-        self._transport.publish(self._key, packet, reliable=not self._lossy)
+    def _hand_over(self, count: int, packet: bytes | bytearray, now: float) -> None:
+        """To the network, and into the history, which nobody can ask for it before it or a later one has gone out."""
+        try:
+            self._transport.publish(self._key, packet, reliable=not self._lossy)
+        finally:
+            self.packets += 1
+            if not self._lossy:
+                last = self._sealer.sequence  # an anchor has no message of its own: it belongs to the last one before it
+                self._history.add(last + 1 - count, last, packet, now, confirms=self._chain and anchored(packet))
 
     # -- the worker --------------------------------------------------------------------------------------------------------
 
@@ -295,8 +276,8 @@ class Publisher:
                 return lambda: self._answer(offers)
             if not self._busy and self._queue and now >= self._free_at and not self._closing:
                 self._busy = True
-                batch = self._take()
-                return lambda: self._ship(batch)
+                batch = self._queue.take()
+                return lambda: self._ship(batch, now)
             if self._closing:
                 return None
             if not self._busy and now >= self._anchor_at:
@@ -314,7 +295,8 @@ class Publisher:
 
     def _show_life(self) -> None:
         try:
-            self._publish([frames.head(frames.Kind.LIFE, time.monotonic() - self._born)], time.time_ns())
+            now = time.monotonic()
+            self._publish([frames.head(frames.Kind.LIFE, now - self._born)], time.time_ns(), now)
         except NoKey:
             self._need_key()
         finally:
@@ -322,16 +304,14 @@ class Publisher:
             self._idle()
             with self._changed:
                 self._pause = min(2 * pause, LAST_LIFE)
-                self._life_at = time.monotonic() + self._pause if not self._lossy else float("inf")
+                self._life_at = time.monotonic() + max(self._pause, self._first_life)
 
     def _anchor(self) -> None:
         """Chain mode: confirm what was sent."""
         try:
-            with self._sealing:
-                after = self._sealer.sequence + 1
-                packet = self._sealer.flush()
-                if packet is not None:
-                    self._hand_over(after, packet)
+            packet = self._sealer.flush()
+            if packet is not None:
+                self._hand_over(1, packet, time.monotonic())
         finally:
             with self._changed:
                 self._busy = False
@@ -358,8 +338,7 @@ class Publisher:
     def _answer(self, offers: list[bytes]) -> None:
         for offer in offers:
             try:
-                with self._sealing:
-                    answer = self._sealer.accept_session(offer)
+                answer = self._sealer.accept_session(offer)
             except Refused as refused:
                 self.refusals.add(refused.reason)
             except NoKey:

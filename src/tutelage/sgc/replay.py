@@ -22,15 +22,17 @@ _BLOCK = 1024
 
 
 class Window:
-    """Which sequence numbers were seen: the highest, and those of the `WINDOW` up to it, in blocks of bits (RFC 6479).
+    """Which sequence numbers were seen: those of the `WINDOW` up to the highest, in blocks of bits (RFC 6479).
 
-    A stream takes as much memory as it has messages, and no bit is ever moved.
+    A stream takes as much memory as it has messages, and no bit is ever moved. The numbers that came last one after the
+    other, without a gap, are only a run: they become bits when the run ends.
     """
 
-    __slots__ = ("_blocks", "highest", "sent")
+    __slots__ = ("_blocks", "_run", "highest", "sent")
 
     def __init__(self) -> None:
         self._blocks: dict[int, int] = {}
+        self._run = 1  # first number of the run that ends with the highest
         self.highest = 0
         self.sent = 0
         """Newest time of sending, nanoseconds."""
@@ -39,28 +41,29 @@ class Window:
         """Are all of `first`, ..., `first + count - 1` new, and not behind the window?"""
         if first > self.highest:
             return True
-        if self.highest - first >= WINDOW:
+        if self.highest - first >= WINDOW or first + count > self._run:
             return False
-        if count == 1:
-            return not self._blocks.get(first // _BLOCK, 0) >> first % _BLOCK & 1
         return not any(self._blocks.get(block, 0) & bits for block, bits in _spans(first, count))
 
     def add(self, first: int, count: int, sent: int) -> None:
-        """Mark them as seen."""
-        last = first + count - 1
-        if count == 1:
-            self._blocks[first // _BLOCK] = self._blocks.get(first // _BLOCK, 0) | 1 << first % _BLOCK
+        """Mark them as seen; they are fresh."""
+        if first == self.highest + 1:
+            self.highest += count
+        elif first < self._run:
+            self._mark(first, count)
         else:
-            for block, bits in _spans(first, count):
-                self._blocks[block] = self._blocks.get(block, 0) | bits
-        if last // _BLOCK > self.highest // _BLOCK:
-            oldest = (last - WINDOW) // _BLOCK
+            self._mark(self._run, self.highest + 1 - self._run)
+            self._run, self.highest = first, first + count - 1
+            oldest = (self.highest - WINDOW) // _BLOCK
             for block in [block for block in self._blocks if block < oldest]:
                 del self._blocks[block]
-        if last > self.highest:
-            self.highest = last
         if sent > self.sent:
             self.sent = sent
+
+    def _mark(self, first: int, count: int) -> None:
+        begin = max(first, self.highest + 1 - WINDOW)  # what is behind the window needs no bits
+        for block, bits in _spans(begin, first + count - begin):
+            self._blocks[block] = self._blocks.get(block, 0) | bits
 
 
 def _spans(first: int, count: int) -> Iterator[tuple[int, int]]:
@@ -99,7 +102,9 @@ class Replay:
         """
         self.check_time(sent, now)
         known = self._senders.get(sender)
-        self._check(known, known.windows.get(salt) if known is not None else None, first, 1, sent)
+        window = known.windows.get(salt) if known is not None else None
+        if window is None or first <= window.highest:  # else it is new, as nearly all are
+            self._check(known, window, first, 1, sent)
 
     def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int) -> None:
         """Take a message (a batch of `count`) that is authentic, once. Its time is for `check_time` to check.
@@ -110,7 +115,8 @@ class Replay:
         with self._lock:
             known = self._senders.get(sender)
             window = known.windows.get(salt) if known is not None else None
-            self._check(known, window, first, count, sent)
+            if window is None or first <= window.highest:
+                self._check(known, window, first, count, sent)
             if known is None:
                 known = self._senders[sender] = _Sender(self._floor)
                 if len(self._senders) > MAX_SENDERS:

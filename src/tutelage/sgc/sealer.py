@@ -21,12 +21,17 @@ from tutelage.sgc.packet import (
     BARE_PROOF,
     BATCH,
     BODY,
+    CHAIN,
     HEADER,
     INTRODUCTION,
     MAX_PAYLOAD,
+    MAX_SESSIONS,
     MODES,
     PROOF,
     SALT_BYTES,
+    SESSION,
+    SIGNATURE,
+    SLOT,
     TAG,
     VERSION,
     Buffer,
@@ -38,11 +43,11 @@ from tutelage.sgc.packet import (
     nonce,
 )
 from tutelage.sgc.reasons import Refusals, Refused
-from tutelage.sgc.rules import Authenticity, Lane
-from tutelage.sgc.session import MAX_SESSIONS, SLOT, Handshake, Session, tags
+from tutelage.sgc.rules import Lane
+from tutelage.sgc.session import Handshake, Session, tags
 
 _SIGNATURE = 64
-_SMALL = 65_536  # bytes up to which copying is cheaper than writing in place
+_SMALL = 16_384  # bytes up to which copying is cheaper than writing in place
 _LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys, certificate and policy
 
 
@@ -90,10 +95,11 @@ class Sealer:
         self._link = Link(anchor_every)
         self._sessions: list[Session] = []
         self._epoch = 0
-        self._looked = 0
+        self._looked = self._look_at = 0
         self._versions = (-1, -1)
         self._entry = self._home.access.check(alias, lane, sends=True)
         self._authenticity = self._entry.rule.authenticity_on(lane)
+        self._mode = MODES[self._authenticity]
         self._name = bytes(self._entry.name)
         self._statements = Statements(self._name, lane)
         self._sender = key_id(self._entry.secret, b"sender", self._home.signing_key.public_key())
@@ -121,7 +127,9 @@ class Sealer:
         Raises:
             As `seal`.
         """
-        return self._seal(join_batch([_flat(payload) for payload in payloads]), BATCH, len(payloads), b"", now)
+        return self._seal(
+            join_batch([p if isinstance(p, bytes) else _flat(p) for p in payloads]), BATCH, len(payloads), b"", now
+        )
 
     def introduce(self) -> None:
         """Let the next packet carry this node's credential, as a receiver said that it does not know us."""
@@ -150,7 +158,7 @@ class Sealer:
             Refused: not from a node that may receive; see the reason. Counted.
             NotAllowed: the topic's authenticity is not "session".
         """
-        if self._authenticity != Authenticity.SESSION:
+        if self._mode != SESSION:
             raise NotAllowed(f'{self.alias} has authenticity "{self._authenticity}" in the policy, so it has no sessions')
         with self._lock:
             with self.refusals.counting():
@@ -173,42 +181,45 @@ class Sealer:
             first = self.sequence + 1
             self.sequence += count
             introduction = b""
-            if self._authenticity != Authenticity.SESSION and not 0 < self._introduce_at - now <= self._introduce_every:
+            if self._mode != SESSION and not 0 < self._introduce_at - now <= self._introduce_every:
                 introduction = self._home.credential
                 self._introduce_at = now + self._introduce_every
-            if self._authenticity == Authenticity.CHAIN and self._link.due(now):
+            if self._mode == CHAIN and self._link.due(now):
                 flags |= ANCHOR
             introduced = len(introduction) + TAG if introduction else 0
-            header = self._header(flags, first, introduced, self._proof_bytes(flags), now)
+            proof = self._proof_bytes(flags)
+            header = self._header(flags, first, introduced, proof, now)
             if not introduced and len(body) <= _SMALL:
                 sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind)
                 return sealed + self._proof(cipher, header, bind, body, flags, first, sealed, now)
-            start = HEADER + introduced  # of the ciphertext; written in place, as every copy of a large message counts
-            packet = bytearray(start + len(body) + TAG)
-            packet[:HEADER] = header
+            # Written in place, at its full length from the beginning: every copy of a large message counts.
+            start = HEADER + introduced
+            end = start + len(body) + TAG
+            packet = bytearray(end + proof)
             with memoryview(packet) as view:
+                view[:HEADER] = header
                 if introduction:
                     cipher.encrypt_into(nonce(INTRODUCTION, header), introduction, header, view[HEADER:start])
-                cipher.encrypt_into(nonce(BODY, header), body, header + bind, view[start:])
-            packet += self._proof(cipher, header, bind, body, flags, first, packet, now)
+                cipher.encrypt_into(nonce(BODY, header), body, header + bind, view[start:end])
+                view[end:] = self._proof(cipher, header, bind, body, flags, first, view[:end], now)
             return packet
 
     def _proof_bytes(self, flags: int) -> int:
-        if self._authenticity == Authenticity.SIGNATURE:
-            return _SIGNATURE + TAG
-        if self._authenticity == Authenticity.SESSION:
+        if self._mode == SESSION:
             return SLOT * len(self._sessions)
+        if self._mode == SIGNATURE:
+            return _SIGNATURE + TAG
         return self._link.proof_bytes(with_message=True) + TAG if flags & ANCHOR else 0
 
     def _proof(
-        self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Packet, now: int
+        self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Buffer, now: int
     ) -> bytes:
-        if self._authenticity == Authenticity.SESSION:
+        if self._mode == SESSION:
             return tags(self._sessions, header, sealed)
         statement = self._statements.message(header, bind, body)
         key = self._home.signing_key
         # A signature is sealed too: in clear, anyone who knows a node's certificate could tell which packets are its own.
-        if self._authenticity == Authenticity.SIGNATURE:
+        if self._mode == SIGNATURE:
             return cipher.encrypt(nonce(PROOF, header), key.sign(statement), header)
         self._link.add(first, statement, now)
         if not flags & ANCHOR:
@@ -217,13 +228,12 @@ class Sealer:
         return cipher.encrypt(nonce(PROOF, header), anchor, header)
 
     def _header(self, flags: int, first: int, introduction: int, proof: int, now: int) -> bytes:
-        mode = MODES[self._authenticity]
-        return make_header(VERSION, mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now)
+        return make_header(VERSION, self._mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now)
 
     def _look(self, now: int) -> AESGCM:
         """The cipher to use now. Looks from time to time, and at every change, whether this node may still send."""
         versions = (self._keyring.version, self._home.version)
-        if self._cipher is not None and versions == self._versions and 0 <= now - self._looked < _LOOK_EVERY:
+        if self._cipher is not None and self._looked <= now < self._look_at and versions == self._versions:
             return self._cipher
         seconds = now / 1e9
         self._home.refresh()
@@ -235,13 +245,13 @@ class Sealer:
         if epoch.number != self._epoch or self._cipher is None:
             key = message_key(epoch.key, self._name, self.lane, epoch.number, self._sender, self.salt)
             self._cipher, self._epoch = AESGCM(key), epoch.number
-        self._sessions = [session for session in self._sessions if self._alive(session, seconds)]
-        self._versions, self._looked = versions, now
+        self._sessions = [session for session in self._sessions if self._alive(session, now)]
+        self._versions, self._looked, self._look_at = versions, now, now + _LOOK_EVERY
         return self._cipher
 
-    def _alive(self, session: Session, now: float) -> bool:
+    def _alive(self, session: Session, now: int) -> bool:
         try:
-            self._home.trust.check(session.member, now)
+            self._home.trust.check(session.member, now / 1e9)
         except Refused:
             return False
         return now < session.until and self._entry.rule.may_receive(session.member.node, self.lane)

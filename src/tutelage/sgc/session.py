@@ -21,7 +21,7 @@ from tutelage.sgc.access import Entry
 from tutelage.sgc.envelope import Curtain, derive
 from tutelage.sgc.grants import MAX_CONTROL, NONCE_BYTES, key_id
 from tutelage.sgc.home import Home
-from tutelage.sgc.packet import SESSION_TAG, TAG, Buffer, nonce
+from tutelage.sgc.packet import MAX_SESSIONS, SESSION_TAG, Buffer, nonce
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import Lane, Role
 from tutelage.sgc.signed import sign, verified
@@ -30,9 +30,6 @@ from tutelage.sgc.wire import pack, unpack
 
 OFFER = b"tutelage session offer 1"
 ANSWER = b"tutelage session answer 1"
-MAX_SESSIONS = 16
-SESSION_ID = 8
-SLOT = SESSION_ID + TAG
 _OFFER_SECONDS = 60.0
 _REMEMBERED = 256
 
@@ -44,12 +41,12 @@ class Session:
     Attributes:
         ident: 8 bytes, in clear beside its tags.
         member: the other end.
-        until: seconds since 1970, when the first of the two certificates expires.
+        until: nanoseconds since 1970, when the first of the two certificates expires.
     """
 
     ident: bytes
     member: Member
-    until: float
+    until: int
     cipher: AESGCM
 
     def tag(self, header: bytes, sealed: Buffer) -> bytes:
@@ -157,21 +154,10 @@ class Handshake:
         except ValueError:
             raise Refused(Reason.MALFORMED, f"an impossible key of {member.node}") from None
         material = derive(shared, hashlib.sha256(body).digest(), pack(b"tutelage session 1", self._lane.encode()), 40)
-        until = min(member.not_after, self._home.member.not_after)
+        until = round(1e9 * min(member.not_after, self._home.member.not_after))
         return Session(material[32:], member, until, AESGCM(material[:32]))
 
 
 def tags(sessions: list[Session], header: bytes, sealed: Buffer) -> bytes:
     """The proof of a packet: id and tag of every session."""
-    return b"".join(session.ident + session.tag(header, sealed) for session in sessions)
-
-
-def slots(proof: memoryview) -> list[tuple[bytes, memoryview]]:
-    """The sessions of a proof, with their tags.
-
-    Raises:
-        Refused: MALFORMED.
-    """
-    if len(proof) % SLOT or len(proof) > SLOT * MAX_SESSIONS:
-        raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
-    return [(bytes(proof[at : at + SESSION_ID]), proof[at + SESSION_ID : at + SLOT]) for at in range(0, len(proof), SLOT)]
+    return b"".join([session.ident + session.tag(header, sealed) for session in sessions])

@@ -18,13 +18,15 @@ from types import TracebackType
 from typing import Self
 
 from tutelage.errors import ConfigError
-from tutelage.sgc import delivery, frames, lanes
+from tutelage.sgc import delivery, lanes
 from tutelage.sgc.access import Authenticity, Delivery, Entry
-from tutelage.sgc.history import make_request, parse_answer
+from tutelage.sgc.assembler import Assembler
 from tutelage.sgc.messages import Message
+from tutelage.sgc.outlet import Outlet
 from tutelage.sgc.reasons import Reason, Refused
+from tutelage.sgc.repairs import Repair, Repairs
 from tutelage.sgc.sealing import Opened, Opener
-from tutelage.sgc.transport.base import NoReply, Transport
+from tutelage.sgc.transport.base import Transport
 from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
@@ -46,19 +48,6 @@ FOR_GOOD = frozenset(
 )
 """Refusals that fetching a packet again does not change."""
 
-ANSWER_TIMEOUT = 0.5, 4.0
-"""Seconds to wait for a publisher to send what is missing: at first, and at most. It doubles when nothing comes: the way may
-be slow, or the question went down with a connection."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Repair:
-    """What a publisher sent when it was asked for missing messages."""
-
-    salt: bytes
-    floor: int
-    packets: list[memoryview]
-
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
@@ -68,7 +57,7 @@ class _Answer:
 
 
 class _Retry:
-    """Something changed: try held packets again."""
+    """Something changed: look for repairs, try held packets again."""
 
 
 class Subscription:
@@ -100,7 +89,7 @@ class Subscription:
             raise ConfigError(f"a queue holds at least one message, not {queue}")
         self.alias = alias
         self.opener = opener
-        self.received = self.packets = self.bytes = self.deferred = self.superseded = self.repaired = self.failed = 0
+        self.packets = self.deferred = self.repaired = 0
         self.last_heard: dict[str, float] = {}
         """When a packet of a sender was last opened, by name; seconds since 1970."""
         self.latency: dict[str, float] = {}
@@ -111,8 +100,9 @@ class Subscription:
         self._entry = entry
         self._transport = transport
         self._need_key = need_key
-        self._pool = pool
-        self._on_message = on_message
+        self._repairs = Repairs(entry, transport, pool, opener.refusals, self._look_again)
+        self.outlet = Outlet(alias, on_message, self._limit, lossy=self._lossy)
+        self._called_back = on_message is not None
         started = time.monotonic()
         patience = delivery.PATIENCE if rule.max_age is None else min(delivery.PATIENCE, rule.max_age)
         self.delivery: delivery.Delivery = (
@@ -120,19 +110,15 @@ class Subscription:
             if self._lossy
             else delivery.InOrder(started, patience, from_first_heard=rule.authenticity == Authenticity.SESSION)
         )
-        self._assemblies: dict[bytes, frames.Assembly] = {}
+        self._assembler = Assembler(alias, opener.refusals, self.delivery.salts)
         self._inbox: queues.SimpleQueue[tuple[float, bytes] | _Answer | _Retry | None] = queues.SimpleQueue()
-        self._repairs: deque[_Repair] = deque()  # before the inbox: what it holds waits for them
         self._inbox_limit = max(self._limit, 64)
         self._inbox_bytes = 0
         self._lock = threading.Lock()
         self._held: deque[tuple[float, bytes]] = deque(maxlen=HELD_PACKETS)
         self._asked: dict[str, float] = {}
         self._last_refusal: Reason | None = None
-        self._timeouts: dict[bytes, float] = {}
         self._offer_at = float("inf")
-        self._out: queues.Queue[Message | None] = queues.Queue(self._limit)
-        self._closed = threading.Event()
         self._direct = direct
         self._turn = threading.Lock()  # whose turn it is to deal with packets, if direct: the network's thread or our own
         self._session = rule.authenticity == Authenticity.SESSION
@@ -155,32 +141,21 @@ class Subscription:
         Raises:
             ConfigError: the subscription has a callback.
         """
-        if self._on_message is not None:
+        if self._called_back:
             raise ConfigError(f"the subscription of {self.alias} has a callback; it cannot be read from as well")
-        try:
-            message = self._out.get(timeout=timeout)
-        except queues.Empty:
-            return None
-        if message is None:
-            self._out.put(None)  # for whoever else waits
-        return message
+        return self.outlet.take(timeout)
 
     def close(self) -> None:
         """Stop; a callback that runs ends first."""
-        if self._closed.is_set():
+        if self.outlet.closed.is_set():
             return
-        self._closed.set()
+        self.outlet.closed.set()
         for handle in self._handles:
             handle.close()
         self._inbox.put(None)
         if threading.current_thread() is not self._thread:
             self._thread.join(5.0)
-        while True:  # whoever reads gets what is there, then the end
-            try:
-                self._out.put_nowait(None)
-                return
-            except queues.Full:
-                self._out.get_nowait()
+        self.outlet.end()
 
     def __enter__(self) -> Self:
         return self
@@ -191,7 +166,7 @@ class Subscription:
     @property
     def closed(self) -> bool:
         """Has it been closed?"""
-        return self._closed.is_set()
+        return self.outlet.closed.is_set()
 
     @property
     def lost(self) -> int:
@@ -201,22 +176,31 @@ class Subscription:
     @property
     def queued(self) -> int:
         """Packets and messages that wait for the application."""
-        return self._inbox.qsize() + self._out.qsize()
+        return self._inbox.qsize() + len(self.outlet)
 
     def retry(self) -> None:
         """A key came: packets that waited for it may be opened now."""
         if self._held:
-            self._inbox.put(_Retry())
+            self._look_again()
+
+    def _look_again(self) -> None:
+        """Wakes our thread."""
+        self._inbox.put(_Retry())
 
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
     def _on_packet(self, packet: bytes) -> None:
-        idle = self._direct and self._inbox.empty() and not self.delivery.crowded
-        if idle and self._turn.acquire(blocking=False):
+        if self.outlet.closed.is_set():
+            return
+        if self._direct and self._inbox.empty() and not self.delivery.crowded and self._turn.acquire(blocking=False):
             try:
-                self._at_once(packet)
+                self.outlet.give(self._take(time.time(), packet))
+            except Exception:
+                log.exception("subscription of %s", self.alias)
             finally:
                 self._turn.release()
+            if self.delivery.wake() is not None:
+                self._look_again()  # our thread sees to the gap
             return
         with self._lock:
             waiting, size = self._inbox.qsize(), self._inbox_bytes + len(packet)
@@ -229,24 +213,13 @@ class Subscription:
             self._drop_oldest()
         self._inbox.put((time.time(), packet))
 
-    def _at_once(self, packet: bytes) -> None:
-        """Deal with a packet on the network's thread; what takes time or has to wait is left to our own."""
-        if self._closed.is_set():
-            return
-        try:
-            self._pass_on(self._take(time.time(), packet))
-        except Exception:
-            log.exception("subscription of %s", self.alias)
-        if self.delivery.wake() is not None:
-            self._inbox.put(_Retry())  # wakes our thread, which then sees to the gap
-
     def _drop_oldest(self) -> None:
         try:
             oldest = self._inbox.get_nowait()
         except queues.Empty:
             return
         if isinstance(oldest, tuple):
-            self.superseded += 1
+            self.outlet.superseded += 1
             with self._lock:
                 self._inbox_bytes -= len(oldest[1])
         else:
@@ -261,7 +234,7 @@ class Subscription:
     def _work(self) -> None:
         if self._session:
             self._offer()
-        while not self._closed.is_set():
+        while not self.outlet.closed.is_set():
             wake = self._wake()
             item: tuple[float, bytes] | _Answer | _Retry | None = None
             with contextlib.suppress(queues.Empty):
@@ -270,8 +243,8 @@ class Subscription:
                     return
             with self._turn:
                 try:
-                    while self._repairs:
-                        self._repair(self._repairs.popleft())
+                    while (repair := self._repairs.take()) is not None:  # before the inbox: what it holds waits for them
+                        self._repair(repair)
                     if item is not None:
                         self._deal_with(item)
                     if wake is not None or self._wake() is not None:
@@ -283,16 +256,16 @@ class Subscription:
         wake = self.delivery.wake()
         return wake if not self._session else self._offer_at if wake is None else min(wake, self._offer_at)
 
-    def _repair(self, repair: _Repair) -> None:
+    def _repair(self, repair: Repair) -> None:
         """What a publisher sent when it was asked."""
         received, refused = time.time(), 0
         for late in repair.packets:
             before = self.packets
-            self._pass_on(self._take(received, late))
+            self.outlet.give(self._take(received, late))
             self.repaired += self.packets > before
             refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
         ready = self.delivery.answered(repair.salt, repair.floor, time.monotonic(), in_vain=refused > 0)
-        self._pass_on(self._messages(ready, received))
+        self.outlet.give(self._assembler.messages(ready, received))
 
     def _deal_with(self, item: tuple[float, bytes] | _Answer | _Retry) -> None:
         if isinstance(item, tuple):
@@ -301,7 +274,7 @@ class Subscription:
             if self._lossy:
                 self._pass_on_newest(self._take(*item))
             else:
-                self._pass_on(self._take(*item))
+                self.outlet.give(self._take(*item))
         elif isinstance(item, _Answer):
             try:
                 self.opener.complete_session(item.packet)
@@ -310,7 +283,7 @@ class Subscription:
         else:
             held, self._held = self._held, deque(maxlen=HELD_PACKETS)
             for received, packet in held:
-                self._pass_on(self._take(received, packet))
+                self.outlet.give(self._take(received, packet))
 
     def _take(self, received: float, packet: bytes | memoryview) -> list[Message]:
         """Open a packet; the messages that it completes."""
@@ -320,21 +293,18 @@ class Subscription:
             self._refused(refused.reason, received, packet)
             return []
         self.packets += 1
-        ready: list[Opened] = []
-        accept, now = self.delivery.accept, time.monotonic()
-        for each in opened:
-            ready += accept(each, now)
-        if opened:
-            self._heard(opened[-1], received)
-        return self._messages(ready, received)
+        if not opened:
+            return []
+        self._heard(opened[-1], received)
+        return self._assembler.messages(self.delivery.accept_all(opened, time.monotonic()), received)
 
     def _heard(self, opened: Opened, received: float) -> None:
         sender, took = opened.sender, received - opened.sent * 1e-9
-        news = sender not in self.last_heard
+        before = self.latency.get(sender)
         self.last_heard[sender] = received
-        self.latency[sender] = took if news else self.latency[sender] + 0.1 * (took - self.latency[sender])
-        if news and self._held:
-            self._inbox.put(_Retry())  # those that waited for the introduction of this sender
+        self.latency[sender] = took if before is None else before + 0.1 * (took - before)
+        if before is None and self._held:
+            self._look_again()  # those that waited for the introduction of this sender
 
     def _refused(self, reason: Reason, received: float, packet: bytes | memoryview) -> None:
         self._last_refusal = reason
@@ -362,54 +332,15 @@ class Subscription:
         self._asked[what] = now
         return True
 
-    def _messages(self, opened: list[Opened], received: float) -> list[Message]:
-        """Frames in order become messages."""
-        messages = []
-        for each in opened:
-            assembly = self._assemblies.get(each.salt)
-            if assembly is None:
-                assembly = self._begin(each)
-            try:
-                payload = assembly.take(each.sequence, each.payload)
-            except Refused as refused:
-                self.opener.refusals.add(refused.reason)
-                continue
-            if payload is not None:
-                messages.append(
-                    Message(payload, each.sender, self.alias, each.sequence, each.sent * 1e-9, received, each.authentic)
-                )
-        return messages
-
-    def _begin(self, first: Opened) -> frames.Assembly:
-        """A sender has started; what an earlier start of it left incomplete is forgotten."""
-        self._assemblies = {salt: a for salt, a in self._assemblies.items() if salt in self.delivery.salts()}
-        assembly = self._assemblies[first.salt] = frames.Assembly()
-        return assembly
-
     def _mend(self) -> None:
         """What time brings: gaps that are asked for, and gaps that are given up."""
         now = time.monotonic()
         if now >= self._offer_at:
             self._offer()
-        self._pass_on(self._messages(self.delivery.due(now), time.time()))
+        self.outlet.give(self._assembler.messages(self.delivery.due(now), time.time()))
         for salt, ranges in self.delivery.questions(now):
-            if not self._pool.submit(self._ask, salt, ranges):
+            if not self._repairs.ask(salt, ranges):
                 self.delivery.answered(salt, 0, now)  # too busy: ask again later
-
-    def _ask(self, salt: bytes, ranges: list[tuple[int, int]]) -> None:
-        """On the pool: ask the publisher for what is missing."""
-        repair, first = _Repair(salt, 0, []), ANSWER_TIMEOUT[0]
-        timeout = self._timeouts.get(salt, first)
-        try:
-            key = lanes.key(self._entry.name, lanes.REPLAY, salt.hex())
-            repair = _Repair(salt, *parse_answer(self._transport.request(key, make_request(ranges), timeout)))
-            self._timeouts.pop(salt, None)
-        except NoReply:
-            self._timeouts = {salt: min(2 * timeout, ANSWER_TIMEOUT[1])}  # of the stream in trouble; others begin anew
-        except Refused as refused:
-            self.opener.refusals.add(refused.reason)
-        self._repairs.append(repair)
-        self._inbox.put(_Retry())
 
     # -- to the application ------------------------------------------------------------------------------------------------
 
@@ -430,29 +361,5 @@ class Subscription:
             more = self._take(*item)
             newest += more
             count += len(more)
-        self.superseded += count - len(newest)
-        self._pass_on(list(newest))
-
-    def _pass_on(self, messages: list[Message]) -> None:
-        for message in messages:
-            self.received += 1
-            self.bytes += len(message.payload)
-            if self._on_message is None:
-                self._put(message)
-                continue
-            try:
-                self._on_message(message)
-            except Exception:
-                self.failed += 1
-                log.exception("the callback of %s", self.alias)
-
-    def _put(self, message: Message) -> None:
-        while not self._closed.is_set():
-            try:
-                self._out.put(message, block=not self._lossy, timeout=0.1)
-                return
-            except queues.Full:
-                if self._lossy:
-                    with contextlib.suppress(queues.Empty):
-                        self._out.get_nowait()
-                        self.superseded += 1
+        self.outlet.superseded += count - len(newest)
+        self.outlet.give(list(newest))

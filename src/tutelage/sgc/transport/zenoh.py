@@ -87,8 +87,10 @@ class ZenohTransport(Transport):
     def publish(self, key: str, payload: bytes | bytearray, *, reliable: bool = True) -> None:
         publisher = self._publishers.get((key, reliable)) or self._publisher(key, reliable)
         if publisher is not None:
-            with contextlib.suppress(self._zenoh.ZError):  # closed between the two lines: lost, as without connection
+            try:  # not `contextlib.suppress`, which costs a twentieth of what a small message does
                 publisher.put(payload)
+            except self._zenoh.ZError:
+                return  # closed between the two lines: lost, as without connection
 
     def subscribe(self, key: str, on_packet: Callable[[bytes], None]) -> Handle:
         check_key(key, wildcard=True)
