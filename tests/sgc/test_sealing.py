@@ -240,6 +240,18 @@ def test_a_sender_whose_certificate_expired_is_refused(own_fleet: Fleet, monkeyp
     assert reason(opener.open, late, now=time.time_ns() + 80 * 10**9) == Reason.EXPIRED
 
 
+@pytest.mark.parametrize("alias", ["camera", "lidar"])
+def test_no_packet_of_the_revoked_makes_way_for_the_next(own_fleet: Fleet, alias: str) -> None:
+    """With or without its credential; a refused one must not count as a look at its sender."""
+    sealer, opener = own_fleet.pair(alias, "drone-2", "server")
+    receive(opener, sealer.seal(b"x"), sealer.flush())
+    own_fleet.revoke("drone-2", tell=["server"])
+    for introduced in (True, False, True, True, False, False):
+        if introduced:
+            sealer.introduce()
+        assert reason(opener.open_many, sealer.seal(b"x")) == Reason.REVOKED
+
+
 def test_the_revoked_are_refused_at_once_by_whoever_has_the_deny_list(own_fleet: Fleet) -> None:
     sealer, opener = own_fleet.pair("camera", "drone-2", "server")
     assert opener.open(sealer.seal(b"x")).sender == "drone-2"

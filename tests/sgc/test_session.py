@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 import time
 
 import pytest
 from members import POLICY, Fleet
 
 from tutelage.sgc.errors import NotAllowed
-from tutelage.sgc.packet import MODES
+from tutelage.sgc.packet import HEADER, MODES, make_header
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.session import MAX_SESSIONS
 
@@ -143,6 +144,16 @@ def test_a_session_ends_with_the_certificate_and_with_revocation(fleet: Fleet) -
     assert sealer.receivers() == ["server"]
     fleet.revoke("operator-2", tell=["server"])
     assert reason(opener.open, sealer.seal(b"x")) == Reason.REVOKED
+
+
+def test_packets_of_a_session_carry_no_credential(fleet: Fleet) -> None:
+    """A credential excuses a packet from the look at whom its stream is known to be of."""
+    sealer, opener = fleet.pair("teleop", "operator-2", "server")
+    packet = sealer.seal(b"x")
+    version, mode, flags, _, *rest = struct.unpack(">BBHHHI16s16sQQ", packet[:HEADER])
+    forged = make_header(version, mode, flags, 3, *rest) + b"abc" + packet[HEADER:]
+    assert reason(opener.open, forged) == Reason.MALFORMED
+    assert opener.open(packet).payload == b"x"
 
 
 def test_a_session_ends_when_the_policy_says_so(fleet: Fleet) -> None:

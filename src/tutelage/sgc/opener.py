@@ -229,11 +229,17 @@ class Opener:
             return self._confirmation.anchor((stream.sender, stream.salt), anchor, member.signing, admit)
 
     def _look_at_stream(self, stream: _Stream, introduced: bool, now: int) -> None:
-        """Is its epoch accepted, may its sender still send? To be asked after each look."""
+        """Is its epoch accepted, may its sender still send? To be asked after each look.
+
+        A packet with a credential answers for itself alone, in `_member`: the credential may be newer than the one known, or
+        that of somebody who was revoked. The next packet without one is looked at anew.
+        """
         key = self._keyring.opening(self.alias, stream.epoch, now / 1e9).key
         if stream.look == _NEVER:
             stream.cipher = AESGCM(message_key(key, self._name, self.lane, stream.epoch, stream.sender, stream.salt))
-        elif stream.member is not None and not introduced:
+        if introduced:
+            return
+        if stream.member is not None:
             self._check(stream.member, now)
         stream.look = self._look_count
 

@@ -94,6 +94,8 @@ def read_layout(start: bytes, mode: int) -> Layout:
         raise Refused(Reason.MALFORMED, "a packet with flags of another mode")
     if mode == SESSION and (proof % SLOT or proof > SLOT * MAX_SESSIONS):
         raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
+    if mode == SESSION and introduction:
+        raise Refused(Reason.MALFORMED, "a packet of a session with a credential, which only its beginning has")
     return Layout(flags, introduction, proof)
 
 
