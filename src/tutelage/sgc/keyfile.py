@@ -25,7 +25,7 @@ class TopicKeys:
         entry: the topic.
         exchange: its requests and grants.
         epochs: its keys.
-        owner: as the newest grant showed it.
+        owner: as the newest grant showed it; None: no grant yet, or this node is the owner.
         path: the file.
         lock: to be held while it is read, changed and written.
     """
@@ -80,7 +80,7 @@ class TopicKeys:
     def made(self, epoch: Epoch, home: Home) -> None:
         """Keep what this node made as the owner, under the deny list and rule of now."""
         self.epochs.add([epoch])
-        self._made_under = self._under(home)
+        self.owner, self._owner, self._made_under = None, home.pseudonym, self._under(home)
         self.save()
 
     def outdated(self, home: Home) -> bool:
