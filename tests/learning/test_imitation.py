@@ -168,7 +168,7 @@ def test_learning_from_scratch_begins_with_new_weights_each_time_and_keeps_the_d
     assert not torch.equal(first[0], learner.policy.net.weights[0])
     assert not torch.equal(first[0], initial[0])
     assert [w.shape for w in first] == [w.shape for w in initial]
-    assert learner.optimiser.state_dict()["state"] == {}
+    assert learner.descent.state_dict() == {}
     assert len(learner.dataset) == 1
 
 

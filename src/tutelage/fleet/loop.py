@@ -21,7 +21,7 @@ from tutelage.fleet.events import Journal
 from tutelage.fleet.execution import AsWanted, Execution
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.modes import HELPED, MOVING, Event, Mode, transition
-from tutelage.fleet.policy import Learner, Policy
+from tutelage.fleet.policy import Learner, Policy, PromptLearner
 from tutelage.fleet.priority import Priority
 from tutelage.fleet.step import Step, Subscriber
 from tutelage.fleet.supervisor import Team
@@ -121,6 +121,9 @@ class Loop:
         self.fleet.step_async(actions, active=MOVING[mode] & ~held)
         if self.learner and self.overlap:
             losses = self.learner.update(self.t)
+        elif isinstance(self.learner, PromptLearner):
+            taught = (mode == Mode.TELEOPERATED) & ~held
+            losses = self.learner.hear(self.t, view.obs[taught], wanted[taught])
         next_obs, reward, _, truncated, info = self.fleet.step_wait()
 
         success = info["success"] & ~info["violation"]  # a robot that fell has not completed anything
