@@ -12,7 +12,7 @@ from tutelage.errors import ConfigError
 from tutelage.fleet.allocation import FleetDAgger
 from tutelage.fleet.events import Events
 from tutelage.fleet.modes import MOVING, Mode
-from tutelage.fleet.policy import Learner
+from tutelage.fleet.policy import Learner, PromptLearner
 from tutelage.fleet.step import Step
 from tutelage.learning.critic import Critic, CriticConfig
 from tutelage.learning.dataset import AggregatedDataset
@@ -133,6 +133,29 @@ def lesson(n: int, ends=()) -> list[Step]:
 )
 def test_the_schedule_says_when_the_policy_changes(config, due) -> None:
     assert np.flatnonzero(changes(make(**config), lesson(6, ends=(1, 4)))).tolist() == due
+
+
+@pytest.mark.parametrize("schedule", ["step", "episode", "scratch", "never"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_to_hear_first_what_humans_want_changes_nothing(schedule, precision) -> None:
+    told = []
+    for prompt in (False, True):
+        learner, losses = make(["risk"], schedule=schedule, every=2, precision=precision), []
+        assert isinstance(learner, PromptLearner)
+        for one in lesson(7, ends=(1, 4)):
+            early = learner.hear(one.t, one.obs[one.taught], one.wanted[one.taught]) if prompt else {}
+            learner.record(one)
+            losses.append(early | learner.update(one.t))
+        told.append((losses, learner.state_dict()))
+    assert told[0][0] == told[1][0]
+    assert same(told[0][1], told[1][1])
+
+
+def same(one, other) -> bool:
+    """Whether two trees of arrays and values are equal to the bit."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return np.array_equal(one, other)
 
 
 def test_an_end_that_nobody_moved_into_ends_no_episode() -> None:

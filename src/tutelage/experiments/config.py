@@ -62,8 +62,8 @@ class RunConfig:
             shipped with the task.
         overlap: learn while physics runs (the update at step t then sees the data up to t - 1).
         threads: physics threads; default: all cores.
-        torch_threads: threads of matrix products, at most; default: all cores, at most 4. Small products, those of fewer than
-            400 robots that observe vectors, are not shared: then up to two threads train the networks of an ensemble.
+        torch_threads: threads of matrix products, at most; default: all cores, at most 4. They share each product for images
+            and for more than 400 robots; else products are too small, and two threads train the networks of the ensemble.
         out: run folder; default: runs/TASK-PRIORITY-sSEED, or runs/TASK-images-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.

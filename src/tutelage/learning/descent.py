@@ -37,6 +37,9 @@ class Descent:
         self.optimiser = adam(net.parameters(), learning_rate)
         self.members = [slice(a, b) for a, b in pairwise(members * k // sides for k in range(sides + 1))]
         self.nets = [_some(net, these) for these in self.members] if sides > 1 else [net]
+        for parameter in net.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        self.gradients = [[p.grad[these] for p in net.parameters() if p.grad is not None] for these in self.members]
 
     def step(self, loss: Callable[[Network, slice], Tensor]) -> float:
         """One step of every network down its loss; returns the mean of the losses.
@@ -44,14 +47,14 @@ class Descent:
         loss: (k,) of k of the networks, given which members they are.
         """
 
-        def ascend(side: int) -> Tensor:
+        def differentiate(side: int) -> Tensor:
             losses = loss(self.nets[side], self.members[side])
-            losses.sum().backward()
+            found = torch.autograd.grad(losses.sum(), list(self.nets[side].parameters()))
+            torch._foreach_copy_(self.gradients[side], found)
             return losses.detach()
 
-        self.optimiser.zero_grad(set_to_none=len(self.nets) == 1)
-        others = [_HELPERS.submit(ascend, side) for side in range(1, len(self.nets))]
-        losses = [ascend(0), *(other.result() for other in others)]
+        others = [_HELPERS.submit(differentiate, side) for side in range(1, len(self.nets))]
+        losses = [differentiate(0), *(other.result() for other in others)]
         self.optimiser.step()
         return float(torch.cat(losses).mean())
 
@@ -65,10 +68,8 @@ class Descent:
 
 
 def _some(net: Network, members: slice) -> Network:
-    """Some of K networks as networks of their own, whose parameters and gradients lie in the memory of those of all."""
+    """Some of K networks as networks of their own, whose parameters lie in the memory of those of all."""
     own = copy.deepcopy(net)
     for mine, everybodys in zip(own.parameters(), net.parameters(), strict=True):
-        if everybodys.grad is None:
-            everybodys.grad = torch.zeros_like(everybodys)
-        mine.data, mine.grad = everybodys.data[members], everybodys.grad[members]
+        mine.data = everybodys.data[members]
     return own
