@@ -2,6 +2,8 @@
 
     observe -> score -> allocate -> act -> step -> reset and re-observe -> record -> learn
 
+What is learned from humans alone may be learned during the step: what they want is known before it (`PromptLearner`).
+
 A single robot with one human is a fleet with N = M = 1. Everything else (recording, progress, checkpoints, plots, the
 console) subscribes to the loop's steps; the loop does not know it.
 """
@@ -44,7 +46,7 @@ class Loop:
         signals: how to compute what the priority looks at, by name; `uncertainty` is the policy's own by default.
         subscribers: listeners.
         execution: what a robot executes while a human is in control; by default what the human wants.
-        overlap: learn while physics runs. The update at step t then sees the data up to t - 1; it still changes the
+        overlap: learn everything while physics runs. The update at step t then sees the data up to t - 1; it still changes the
             policy from t + 1 on.
         wait: robots that need a human stand still until one is with them, instead of going on by themselves meanwhile.
         seed: root seed.

@@ -54,9 +54,9 @@ class Descent:
             return losses.detach()
 
         others = [_HELPERS.submit(differentiate, side) for side in range(1, len(self.nets))]
-        losses = [differentiate(0), *(other.result() for other in others)]
+        losses = torch.cat([differentiate(0), *(other.result() for other in others)])
         self.optimiser.step()
-        return float(torch.cat(losses).mean())
+        return float(losses.sum()) / len(losses)
 
     def state_dict(self) -> dict[str, Any]:
         """The moments of each parameter of the K networks, by position (copies)."""
