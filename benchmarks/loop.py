@@ -12,6 +12,7 @@ import torch
 from benchmarks.fleets import OFFLINE, ready
 from benchmarks.original_loop import OriginalLoop
 from benchmarks.timing import Phases, ratio, table, take_turns
+from tutelage.cores import default_torch_threads
 from tutelage.envs import mujoco_fleet
 from tutelage.envs.engine import wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
@@ -58,7 +59,7 @@ class Ours:
         self.loop.run(WARM)
 
     def threads(self) -> None:
-        """Give matrix products as many threads as this run does; not part of what is timed."""
+        """Let as many threads share a matrix product as in this run; not part of what is timed."""
         torch.set_num_threads(self.torch_threads)
 
     def __call__(self) -> None:
@@ -130,7 +131,8 @@ def watch(ours: Ours) -> Phases:
     phases.watch(fleet, "reset", "reset")
     phases.watch(fleet.physics, "restart", "physics")  # type: ignore[attr-defined]
     phases.watch(learner, "record", "record")
-    phases.watch(learner, "update", "gradients")
+    phases.watch(learner, "hear", "gradients, beside physics")
+    phases.watch(learner, "update", "gradients, after it")
     phases.watch(learner.dataset, "batches", "sampling")
     for critic in learner.critics.values():
         for ring in (critic.plain, critic.events):
@@ -167,6 +169,7 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         (data.obs.rows[:OFFLINE].numpy(), data.actions.rows[:OFFLINE].numpy()), PRETRAIN, moved.counts.append,
     )  # fmt: skip
     original.run(WARM)
+    share: Callable[[], None] = lambda: torch.set_num_threads(default_torch_threads())  # noqa: E731 - PyTorch's own choice
     for counter in (lockstep.moved, overlap.moved, moved):
         counter.counts.clear()
 
@@ -179,7 +182,7 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
                 "ours, bfloat16": low, "overlap, bfloat16": low_overlap,
                 "raw physics": physics, "raw gradients": gradients,
             }, rounds, before={
-                "original": lockstep.threads, "ours": lockstep.threads, "ours, overlap": overlap.threads,
+                "original": share, "ours": lockstep.threads, "ours, overlap": overlap.threads,
                 "ours, bfloat16": low.threads, "overlap, bfloat16": low_overlap.threads,
                 "raw physics": physics.rewind, "raw gradients": lockstep.threads,
             },
@@ -187,7 +190,6 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
     finally:
         mujoco_fleet.wait = wait  # type: ignore[attr-defined]
     original.envs.close()
-    lockstep.threads()
     floors = ("raw physics", "raw gradients")
     return {
         "milliseconds": {name: 1e3 * float(np.median(seconds[name])) / steps for name in VARIANTS},
@@ -201,5 +203,9 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         },
         "robots that moved": {"original": moved.mean, "ours": lockstep.moved.mean, "ours, overlap": overlap.moved.mean},
         "phases": {name: 1e3 * took / steps / rounds for name, took in sorted(phases.seconds.items(), key=lambda p: -p[1])},
-        "threads": {"physics": lockstep.loop.fleet.physics.threads, "torch": torch.get_num_threads()},  # type: ignore[attr-defined]
+        "threads": {
+            "physics": lockstep.loop.fleet.physics.threads,  # type: ignore[attr-defined]
+            "torch": lockstep.torch_threads,
+            "torch, original": default_torch_threads(),
+        },
     }

@@ -38,6 +38,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "overlap": {"overlap": True, "learner": {"schedule": "episode"}, "robots": 8},
+    "threads": {"torch_threads": 2},
     "latency": {"latency": 2, "supervisor_noise": 0.3},
     "scratch": {"learner": {"schedule": "scratch", "every": 7, "gradient_steps": 3}, "overlap": True},
     "everything": {
@@ -48,7 +49,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(
     ("make", "variant"),
-    [(walker, "plain"), (walker, "everything"), *((points, variant) for variant in VARIANTS)],
+    [(walker, "plain"), (walker, "threads"), (walker, "everything"), *((points, variant) for variant in VARIANTS)],
     ids=lambda value: getattr(value, "__name__", value),
 )
 def test_a_run_killed_at_a_seeded_timestep_continues_bit_for_bit(

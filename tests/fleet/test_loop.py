@@ -29,6 +29,7 @@ from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.allocation import FleetDAgger
 from tutelage.fleet.events import Events
 from tutelage.fleet.modes import END_OF_STEP, Event, Mode
+from tutelage.fleet.policy import PromptLearner
 from tutelage.fleet.priority import PriorityConfig, parse
 from tutelage.fleet.step import Step
 from tutelage.fleet.supervisor import NoisySupervisor, PolicySupervisor, Team
@@ -97,6 +98,39 @@ def test_with_overlap_learning_happens_while_physics_runs() -> None:
     log.clear()
     loop.step()
     assert log[-5:] == ["step_async", "update", "step_wait", "reset", "record"]
+
+
+def test_a_prompt_learner_hears_what_humans_want_while_physics_runs_and_the_rest_after_it() -> None:
+    class Prompt(FakeLearner):
+        def hear(self, t, obs, wanted) -> dict[str, float]:
+            self.log.append("hear")
+            heard.append((t, obs.copy(), wanted.copy()))
+            return {"heard": float(t)}
+
+    log: list[Any] = []
+    heard: list[Any] = []
+    loop = make_loop(PointFleet(3, log=log), wants([0.0, 1.0, 0.0]), 1, learner=Prompt(log))
+    assert isinstance(loop.learner, PromptLearner)
+    loop.step()
+    log.clear()
+    step = loop.step()
+    assert [what for what in log if what in ("step_async", "hear", "step_wait", "record", "update")] == [
+        "step_async", "hear", "step_wait", "record", "update",
+    ]  # fmt: skip
+    t, obs, wanted = heard[-1]
+    assert t == step.t == 1
+    assert step.taught.tolist() == [False, True, False]
+    np.testing.assert_array_equal(obs, step.obs[step.taught])
+    np.testing.assert_array_equal(wanted, step.wanted[step.taught])
+    assert step.losses == {"heard": 1.0, "policy": 1.0}
+
+
+def test_with_overlap_nothing_is_heard_early() -> None:
+    class Prompt(FakeLearner):
+        def hear(self, t, obs, wanted) -> dict[str, float]:
+            raise AssertionError
+
+    make_loop(PointFleet(2), wants([1.0, 0.0]), learner=Prompt(), overlap=True).step()
 
 
 @pytest.mark.parametrize(("overlap", "known"), [(False, [1, 2, 3, 4]), (True, [0, 1, 2, 3])])

@@ -12,7 +12,7 @@ from tutelage.errors import ConfigError
 from tutelage.fleet.allocation import FleetDAgger
 from tutelage.fleet.events import Events
 from tutelage.fleet.modes import MOVING, Mode
-from tutelage.fleet.policy import Learner
+from tutelage.fleet.policy import Learner, PromptLearner
 from tutelage.fleet.step import Step
 from tutelage.learning.critic import Critic, CriticConfig
 from tutelage.learning.dataset import AggregatedDataset
@@ -135,6 +135,29 @@ def test_the_schedule_says_when_the_policy_changes(config, due) -> None:
     assert np.flatnonzero(changes(make(**config), lesson(6, ends=(1, 4)))).tolist() == due
 
 
+@pytest.mark.parametrize("schedule", ["step", "episode", "scratch", "never"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_to_hear_first_what_humans_want_changes_nothing(schedule, precision) -> None:
+    told = []
+    for prompt in (False, True):
+        learner, losses = make(["risk"], schedule=schedule, every=2, precision=precision), []
+        assert isinstance(learner, PromptLearner)
+        for one in lesson(7, ends=(1, 4)):
+            early = learner.hear(one.t, one.obs[one.taught], one.wanted[one.taught]) if prompt else {}
+            learner.record(one)
+            losses.append(early | learner.update(one.t))
+        told.append((losses, learner.state_dict()))
+    assert told[0][0] == told[1][0]
+    assert same(told[0][1], told[1][1])
+
+
+def same(one, other) -> bool:
+    """Whether two trees of arrays and values are equal to the bit."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return np.array_equal(one, other)
+
+
 def test_an_end_that_nobody_moved_into_ends_no_episode() -> None:
     """A violated robot stays in violation for many steps; only its fall ends an episode."""
     waiting = [step([Mode.TELEOPERATED, Mode.VIOLATED], t=t, violation=[False, True]) for t in range(3)]
@@ -168,7 +191,7 @@ def test_learning_from_scratch_begins_with_new_weights_each_time_and_keeps_the_d
     assert not torch.equal(first[0], learner.policy.net.weights[0])
     assert not torch.equal(first[0], initial[0])
     assert [w.shape for w in first] == [w.shape for w in initial]
-    assert learner.optimiser.state_dict()["state"] == {}
+    assert learner.descent.state_dict() == {}
     assert len(learner.dataset) == 1
 
 

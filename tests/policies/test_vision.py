@@ -157,7 +157,7 @@ def test_it_learns_where_a_bright_spot_is() -> None:
     first = last = 0.0
     for step in range(60):
         index = torch.from_numpy(rng.integers(64, size=(2, 16)))
-        loss = policy.loss(torch.from_numpy(obs)[index], actions[index])
+        loss = policy.loss(torch.from_numpy(obs)[index], actions[index]).sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

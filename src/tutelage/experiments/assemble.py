@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tutelage.cores import available_cores, default_torch_threads
+from tutelage.cores import default_torch_threads, keep_freed_memory
 from tutelage.envs import experts
 from tutelage.envs.registry import find_task, make_fleet
 from tutelage.envs.task_fleet import TaskFleet
@@ -133,13 +133,14 @@ def assemble(config: RunConfig) -> Assembly:
     """
     find_task(config.task)
     config = _resolve_defaults(config)
-    torch.set_num_threads(config.torch_threads or 1)
     parse(config.priority, config.thresholds, config.gate)  # refused before an expert is looked for
     actor = _expert(config)
     fleet = fleet_of(config, config.robots, config.disturbance)
 
     shape, actions = _obs_shape(fleet, config), len(fleet.action_low)
     config = sized(config, shape)
+    torch.set_num_threads(config.torch_threads or 1 if _share_products(config, shape) else 1)
+    keep_freed_memory()
     known = shape[0] if fleet.state is None else fleet.state.shape[1]
     if isinstance(actor, GaussianActor) and (actor.features > known or len(actor.low) != actions):
         raise ContractError(
@@ -194,7 +195,16 @@ def learner_of(config: RunConfig, shape: tuple[int, ...], low: Array, high: Arra
             policy, dataset, stream(config.seed, "classifier"), derive(config.seed, "classifier/initial weights"),
             beta_h=np.nan if config.gate.beta_h is None else config.gate.beta_h, batch=config.learner.batch,
         )  # fmt: skip
-    return ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed)
+    threads = 1 if _share_products(config, shape) else config.torch_threads or 1
+    return ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed, threads)
+
+
+def _share_products(config: RunConfig, shape: tuple[int, ...]) -> bool:
+    """Whether threads share each matrix product. It pays for images and for many robots; for others, meeting costs more.
+
+    There, networks learn side by side instead, see `Descent`.
+    """
+    return len(shape) == 3 or config.robots > 400
 
 
 def fleet_of(config: RunConfig, num_envs: int, level: str | None, **settings: Any) -> Fleet:
@@ -235,9 +245,7 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
         initial = task.initial_period if task and config.priority.strip(".") == "C.U.R" else 0
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
     if config.torch_threads is None:
-        changes["torch_threads"] = 1 if config.overlap else default_torch_threads()
-    if config.threads is None and config.overlap and task:
-        changes["threads"] = max(1, available_cores() - 1)  # the last core learns
+        changes["torch_threads"] = default_torch_threads()
     if set(config.priority.split(".")) <= {"C", ""}:
         # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).
         changes["learner"] = dataclasses.replace(config.learner, schedule="never")

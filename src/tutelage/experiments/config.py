@@ -60,9 +60,10 @@ class RunConfig:
         supervisor_noise: standard deviation of the humans' trembling, as a fraction of half the action range.
         expert: the algorithmic humans: a file of weights, or module:function that returns a policy; default: the weights
             shipped with the task.
-        overlap: learn while physics runs (the update at step t then sees the data up to t - 1).
-        threads: physics threads; default: all cores, or with overlap all but one.
-        torch_threads: threads of matrix products; default: all cores, at most 4, or with overlap 1.
+        overlap: learn everything while physics runs (the update at step t then sees the data up to t - 1).
+        threads: physics threads; default: all cores.
+        torch_threads: threads of matrix products, at most; default: all cores, at most 4. They share each product for images
+            and for more than 400 robots; else products are too small, and two threads train the networks of the ensemble.
         out: run folder; default: runs/TASK-PRIORITY-sSEED, or runs/TASK-images-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.

@@ -2,6 +2,8 @@
 
     observe -> score -> allocate -> act -> step -> reset and re-observe -> record -> learn
 
+What is learned from humans alone may be learned during the step: what they want is known before it (`PromptLearner`).
+
 A single robot with one human is a fleet with N = M = 1. Everything else (recording, progress, checkpoints, plots, the
 console) subscribes to the loop's steps; the loop does not know it.
 """
@@ -21,7 +23,7 @@ from tutelage.fleet.events import Journal
 from tutelage.fleet.execution import AsWanted, Execution
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.modes import HELPED, MOVING, Event, Mode, transition
-from tutelage.fleet.policy import Learner, Policy
+from tutelage.fleet.policy import Learner, Policy, PromptLearner
 from tutelage.fleet.priority import Priority
 from tutelage.fleet.step import Step, Subscriber
 from tutelage.fleet.supervisor import Team
@@ -44,8 +46,8 @@ class Loop:
         signals: how to compute what the priority looks at, by name; `uncertainty` is the policy's own by default.
         subscribers: listeners.
         execution: what a robot executes while a human is in control; by default what the human wants.
-        overlap: learn while physics runs. The update at step t then sees the data up to t - 1; it still changes the
-            policy from t + 1 on.
+        overlap: learn everything while physics runs. The update at step t then sees the data up to t - 1; it still changes
+            the policy from t + 1 on.
         wait: robots that need a human stand still until one is with them, instead of going on by themselves meanwhile.
         seed: root seed.
     """
@@ -121,6 +123,9 @@ class Loop:
         self.fleet.step_async(actions, active=MOVING[mode] & ~held)
         if self.learner and self.overlap:
             losses = self.learner.update(self.t)
+        elif isinstance(self.learner, PromptLearner):
+            taught = (mode == Mode.TELEOPERATED) & ~held
+            losses = self.learner.hear(self.t, view.obs[taught], wanted[taught])
         next_obs, reward, _, truncated, info = self.fleet.step_wait()
 
         success = info["success"] & ~info["violation"]  # a robot that fell has not completed anything

@@ -49,3 +49,16 @@ class Learner(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         ...
+
+
+@runtime_checkable
+class PromptLearner(Learner, Protocol):
+    """A learner that need not wait for the outcome of a timestep to learn from what humans said in it."""
+
+    def hear(self, t: int, obs: Array, wanted: Array) -> dict[str, float]:
+        """Take in what humans want of n robots in timestep t, obs (n, ...) and wanted (n, A), and learn from it.
+
+        Called while physics runs. `record` and `update` follow and do the rest, so that the result is the same as if they
+        had done all. Returns losses by name.
+        """
+        ...

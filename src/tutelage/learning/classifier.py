@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from tutelage.fleet.discrepancy import discrepancy
 from tutelage.learning.dataset import AggregatedDataset
-from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
+from tutelage.learning.descent import Descent
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.policies.networks import as_tensor, hidden_layers, network, stored_as
 from tutelage.policies.weights import load_module_state, module_state
@@ -52,7 +53,7 @@ class DiscrepancyClassifier:
         shape, width = policy.obs_shape, dataset.actions.rows.shape[1]
         self.held_out = AggregatedDataset(shape, width, 1, rng, bootstrap=False, dtype=stored_as(shape))
         self.net = network(shape, 1, 1, hidden_layers(shape, hidden, (128, 128)), torch.Generator().manual_seed(seed))
-        self.optimiser = adam(self.net.parameters(), learning_rate)
+        self.descent = Descent(self.net, learning_rate)
 
     @torch.no_grad()
     def __call__(self, obs: Array) -> Array:
@@ -74,11 +75,7 @@ class DiscrepancyClassifier:
             obs = torch.cat([data.obs.rows[torch.from_numpy(rows)] for data, rows in parts])
             actions = torch.cat([data.actions.rows[torch.from_numpy(rows)] for data, rows in parts])
             unsafe = torch.from_numpy(self.discrepancies(obs.numpy(), actions.numpy()) >= self.beta_h).float()
-            error = torch.nn.functional.binary_cross_entropy_with_logits(self._logit(obs), unsafe)
-            self.optimiser.zero_grad(set_to_none=True)
-            error.backward()
-            self.optimiser.step()
-            loss = float(error.detach())
+            loss = self.descent.step(partial(self._loss, obs, unsafe))
         self.policy.forget()
         return loss
 
@@ -99,13 +96,16 @@ class DiscrepancyClassifier:
                 stacklevel=2,
             )
 
+    def _loss(self, obs: torch.Tensor, unsafe: torch.Tensor, *_: Any) -> torch.Tensor:
+        return torch.nn.functional.binary_cross_entropy_with_logits(self._logit(obs), unsafe)[None]
+
     def _logit(self, obs: torch.Tensor) -> torch.Tensor:
         return self.net(self.policy.normalise(obs))[0, :, 0]  # type: ignore[no-any-return]
 
     def state_dict(self) -> dict[str, Any]:
         """Network, optimiser, held-out data and random state."""
         return {
-            "beta_h": self.beta_h, "net": module_state(self.net), "adam": optimiser_state(self.optimiser),
+            "beta_h": self.beta_h, "net": module_state(self.net), "adam": self.descent.state_dict(),
             "held_out": self.held_out.state_dict(), "rng": rng_state(self.rng),
         }  # fmt: skip
 
@@ -113,6 +113,6 @@ class DiscrepancyClassifier:
         """Restore what `state_dict` returned."""
         self.beta_h = state["beta_h"]
         load_module_state(self.net, state["net"])
-        load_optimiser_state(self.optimiser, state["adam"])
+        self.descent.load_state_dict(state["adam"])
         self.held_out.load_state_dict(state["held_out"])
         set_rng_state(self.rng, state["rng"])

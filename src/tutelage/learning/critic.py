@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tutelage.errors import ConfigError
 from tutelage.fleet.policy import Policy
-from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
+from tutelage.learning.descent import Descent
 from tutelage.policies.networks import Network, Shape, as_tensor, hidden_layers, network, normalise, shape_of, stored_as
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import rng_state, set_rng_state
@@ -156,7 +156,7 @@ class Critic:
             network(obs, 2, 1, hidden, torch.Generator().manual_seed(seed), torch.sigmoid, extra=action_width)
             for _ in range(2)
         )
-        self.optimiser = adam(self.net.parameters(), config.learning_rate)
+        self.descent = Descent(self.net, config.learning_rate)
         self.plain = Ring(config.capacity, obs, action_width)
         self.events = Ring(max(1, config.capacity // 10), obs, action_width)
 
@@ -182,18 +182,16 @@ class Critic:
         if positives:
             rows = torch.cat([rows, self.events.draw(positives, self.rng)])
         batch = self.plain.columns(rows)
-        event = torch.arange(len(rows)) >= len(rows) - positives
+        y = torch.ones(len(rows))  # of events, which come last
         with torch.no_grad():
-            then = torch.from_numpy(np.asarray(self.policy.act(batch["next_obs"].numpy()), np.float32))
-            future = self._worst(self._q(self.target, batch["next_obs"], then))
-            y = torch.where(event, 1.0, self.config.gamma * (1 - batch["end"]) * future)
-        loss = (self._q(self.net, batch["obs"], batch["action"]) - y).square().mean(dim=1).sum()
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimiser.step()
+            after, end = (batch[name][: len(rows) - positives] for name in ("next_obs", "end"))
+            then = torch.from_numpy(np.asarray(self.policy.act(after.numpy()), np.float32))
+            future = self._worst(self._q(self.target, after, then))
+            y[: len(after)] = self.config.gamma * (1 - end) * future
+        loss = self.descent.step(lambda net, _: (self._q(net, batch["obs"], batch["action"]) - y).square().mean(dim=1))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.target.parameters()), list(self.net.parameters()), self.config.tau)
-        return float(loss.detach()) / 2
+        return loss
 
     def _worst(self, q: Tensor) -> Tensor:
         """The more pessimistic twin: (2, B) -> (B,)."""
@@ -214,7 +212,7 @@ class Critic:
         return {
             "net": module_state(self.net),
             "target": module_state(self.target),
-            "adam": optimiser_state(self.optimiser),
+            "adam": self.descent.state_dict(),
             "plain": self.plain.state_dict(),
             "events": self.events.state_dict(),
             "rng": rng_state(self.rng),
@@ -224,7 +222,7 @@ class Critic:
         """Restore what `state_dict` returned."""
         load_module_state(self.net, state["net"])
         load_module_state(self.target, state["target"])
-        load_optimiser_state(self.optimiser, state["adam"])
+        self.descent.load_state_dict(state["adam"])
         self.plain.load_state_dict(state["plain"])
         self.events.load_state_dict(state["events"])
         set_rng_state(self.rng, state["rng"])

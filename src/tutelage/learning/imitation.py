@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tutelage.errors import ConfigError
 from tutelage.fleet.step import Step
 from tutelage.learning.classifier import DiscrepancyClassifier
 from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
-from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
+from tutelage.learning.descent import Descent
 from tutelage.policies.ensemble import EnsemblePolicy
+from tutelage.policies.networks import Network
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import derive
 
@@ -65,6 +69,7 @@ class ImitationLearner:
         critics: by the name of the signal they estimate: "risk" or "goal".
         classifier: f of SafeDAgger, updated whenever the policy is.
         seed: root seed, for new initial weights.
+        threads: in which the members of the ensemble learn, see `Descent`.
     """
 
     def __init__(
@@ -75,36 +80,44 @@ class ImitationLearner:
         critics: dict[str, Critic] | None = None,
         classifier: DiscrepancyClassifier | None = None,
         seed: int = 0,
+        threads: int = 1,
     ) -> None:
-        self.policy, self.dataset, self.config, self.seed = policy, dataset, config, seed
+        self.policy, self.dataset, self.config, self.seed, self.threads = policy, dataset, config, seed, threads
         self.critics, self.classifier = critics or {}, classifier
-        self.optimiser = adam(policy.parameters(), config.learning_rate)
+        self.descent = Descent(policy.net, config.learning_rate, threads)
         self.restarts, self._episode_ended = 0, False
+        self._heard: int | None = None
 
     def gradient_steps(self, n: int) -> float:
         """n gradient steps of behaviour cloning on all data so far; returns the last loss, mean over members."""
-        loss = torch.zeros(())
+        loss = 0.0
         for _ in range(n):
             obs, actions = self.dataset.batches(self.config.batch)
-            loss = self.policy.loss(obs, actions)
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            self.optimiser.step()
+            loss = self.descent.step(partial(self._loss, obs, actions))
         self.policy.forget()
-        return float(loss.detach()) / self.policy.members
+        return loss
+
+    def _loss(self, obs: Tensor, actions: Tensor, net: Network, members: slice) -> Tensor:
+        return self.policy.loss(obs[members], actions[members], net)
 
     def restart(self) -> None:
         """New initial weights and a new optimiser; the data stay."""
         self.restarts += 1
         self.policy.restart(derive(self.seed, f"policy/restart {self.restarts}"))
-        self.optimiser = adam(self.policy.parameters(), self.config.learning_rate)
+        self.descent = Descent(self.policy.net, self.config.learning_rate, self.threads)
 
     # -- the Learner of the loop --------------------------------------------------------------------------------
 
+    def hear(self, t: int, obs: Array, wanted: Array) -> dict[str, float]:
+        """Human actions into the dataset; the policy learns from them at once, unless its schedule waits for the outcome."""
+        self._heard = t
+        self._add(obs, wanted)
+        return {} if self.config.schedule == "episode" else self._precisely(self._imitate, t)
+
     def record(self, step: Step) -> None:
-        """Human actions into the dataset; every transition into the critics."""
-        if step.taught.any():
-            self.dataset.add(step.obs[step.taught], step.wanted[step.taught])
+        """Human actions into the dataset, unless they were heard; every transition into the critics."""
+        if self._heard != step.t:
+            self._add(step.obs[step.taught], step.wanted[step.taught])
         self._episode_ended = bool((step.truncated | step.success | step.violation)[step.moved].any())
         if self.critics:
             moved = step.moved
@@ -115,16 +128,33 @@ class ImitationLearner:
                 critic.add(obs, action, after, event, end=violation | (success & ~step.truncated[moved]))
 
     def update(self, t: int) -> dict[str, float]:
-        """What is due at timestep t."""
+        """What is due at timestep t, less what `hear` did already."""
+        return self._precisely(self._improve, t)
+
+    def _add(self, obs: Array, wanted: Array) -> None:
+        if len(obs):
+            self.dataset.add(obs, wanted)
+
+    def _precisely(self, work: Callable[[int], dict[str, float]], t: int) -> dict[str, float]:
+        """Work at timestep t with matrix products of the precision that the configuration asks for."""
         if self.config.precision == "float32":
-            return self._update(t)
+            return work(t)
         torch.set_float32_matmul_precision("medium")  # of this process, so only while nothing else computes
         try:
-            return self._update(t)
+            return work(t)
         finally:
             torch.set_float32_matmul_precision("highest")
 
-    def _update(self, t: int) -> dict[str, float]:
+    def _improve(self, t: int) -> dict[str, float]:
+        done = self._heard == t and self.config.schedule != "episode"
+        losses = {} if done else self._imitate(t)
+        for name, critic in self.critics.items():
+            if self.config.schedule != "never" and (t + 1) % critic.config.every == 0:
+                losses[name] = critic.update()
+        return {name: loss for name, loss in losses.items() if np.isfinite(loss)}
+
+    def _imitate(self, t: int) -> dict[str, float]:
+        """The policy, and the classifier, which follows it."""
         losses: dict[str, float] = {}
         c = self.config
         due = {
@@ -139,15 +169,12 @@ class ImitationLearner:
             losses["policy"] = self.gradient_steps(c.gradient_steps)
             if self.classifier:
                 losses["classifier"] = self.classifier.updates(c.gradient_steps)
-        for name, critic in self.critics.items():
-            if c.schedule != "never" and (t + 1) % critic.config.every == 0:
-                losses[name] = critic.update()
         return {name: loss for name, loss in losses.items() if np.isfinite(loss)}
 
     def state_dict(self) -> dict[str, Any]:
         return {
             "policy": module_state(self.policy),
-            "adam": optimiser_state(self.optimiser),
+            "adam": self.descent.state_dict(),
             "dataset": self.dataset.state_dict(),
             "critics": {name: critic.state_dict() for name, critic in self.critics.items()},
             **({"classifier": self.classifier.state_dict()} if self.classifier else {}),
@@ -158,10 +185,11 @@ class ImitationLearner:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_module_state(self.policy, state["policy"])
         self.policy.forget()
-        load_optimiser_state(self.optimiser, state["adam"])
+        self.descent.load_state_dict(state["adam"])
         self.dataset.load_state_dict(state["dataset"])
         for name, critic in self.critics.items():
             critic.load_state_dict(state["critics"][name])
         if self.classifier:
             self.classifier.load_state_dict(state["classifier"])
         self.restarts, self._episode_ended = state["restarts"], state["episode_ended"]
+        self._heard = None
