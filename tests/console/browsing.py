@@ -135,7 +135,8 @@ class Served:
 
     @staticmethod
     def environment() -> dict[str, str]:
-        return os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        path = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])  # `lasting`
+        return os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", "PYTHONPATH": path}
 
 
 def until(holds: Callable[[], object], what: str, seconds: float = 15.0) -> None:
