@@ -16,19 +16,19 @@ LAST = np.array(SIZE) - 1.0
 
 
 class Lasting(Navigation):
-    """Navigation without walls, goal, wind and horizon. Violation: the robot is two cells to the left of its start, or farther.
+    """Navigation without walls, goal, wind and horizon. Violation: the robot is three cells to the left of its start, or farther.
 
-    A policy that knows nothing yet stays where it is, as actions below 0.5 move nothing.
+    Only whole actions move it, which keys give and a policy that knows nothing does not.
     """
 
     horizon = 10**7
     disturbance = "none"
 
     def advance(self, state: NDArray[Any], actions: NDArray[Any], world: World) -> NDArray[Any]:
-        return np.clip(super().advance(state, actions, world), 0.0, LAST)
+        return np.clip(super().advance(state, np.trunc(actions), world), 0.0, LAST)
 
     def violation(self, state: NDArray[Any]) -> NDArray[np.bool_]:
-        return np.asarray(state[:, 0] <= START[0] - 2)
+        return np.asarray(state[:, 0] <= START[0] - 3)
 
     def success(self, state: NDArray[Any]) -> NDArray[np.bool_]:
         return np.zeros(len(state), dtype=bool)

@@ -413,6 +413,22 @@ def test_many_robots_are_watched_only_where_they_are_seen(browser: Any, served: 
         assert '"streams":[]' in [said for said in asked if '"watch"' in said][-1]
 
 
+def test_a_robot_in_violation_is_set_up_again(browser: Any, served: Served) -> None:
+    """Late in this file, as the policy learns from it where to fall."""
+    with person(browser, served.origin, "ana") as ana:
+        take(ana, 1)
+        ana.page.keyboard.down("ArrowLeft")
+        ana.see(".stage-head", "Violated")
+        ana.page.keyboard.up("ArrowLeft")
+        if not ana.page.locator(".stage-mine").count():  # its episode ended, and with it what ana had of it
+            take(ana, 1)
+        ana.see(".driving", "It needs a hard reset")
+        ana.page.keyboard.press("h")
+        ana.page.get_by_role("dialog").get_by_role("button", name="Reset").click()
+        ana.see(".note", "reset is done")
+        ana.page.wait_for_selector(".stage-mine", state="detached")
+
+
 def test_the_page_comes_back_when_the_server_does(browser: Any, served: Served) -> None:
     somebody = Person(browser, served.origin, "ana")
     try:
