@@ -82,7 +82,9 @@ class WebConfig:
         try:
             ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{self.certificate} and {self.key} cannot be used: {error}") from None
+            raise ConfigError(
+                f"{self.certificate} and {self.key} cannot be used: {getattr(error, 'strerror', None) or error}"
+            ) from None
 
 
 def uvicorn_config(app: App, host: str, port: int, **options: Any) -> uvicorn.Config:
