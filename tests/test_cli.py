@@ -245,7 +245,7 @@ def refused(said: Said) -> str:
         (["run", "Walker2d", "--step", "3"], "(did you mean --steps?)"),
         (["run", "Walker2d", "--seeds", "3"], "Unrecognized options: --seeds 3 (did you mean --seed?) (see"),
         (["rnu", "Walker2d"], "unknown command 'rnu' (did you mean run?); commands: run, resume, evaluate, "),
-        (["keys", "reveal"], "unknown command 'reveal' (did you mean renew?); commands: init, issue, renew, "),
+        (["keys", "reveal"], "unknown command 'reveal' (did you mean revoke?); commands: init, issue, renew, "),
         ([], "no command given; commands: run, resume, evaluate, report, reproduce, train-expert, watch, check, info"),
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),

@@ -461,23 +461,23 @@ def _problem(box: str, place: str) -> str:
         box: its text.
         place: the help of the verb, such as "tutelage run --help".
     """
-    lines = [line.strip("│╭╮╰╯ ").strip() for line in box.splitlines()[1:]]
-    told = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines))
-    told = re.sub(r" \(applied to [^)]*\)| Arguments are applied to the .* matter\.", "", told.replace(" or misplaced", ""))
-    told = " ".join(told.split()).rstrip(".")
-    given = re.search(r"(?<=: )--[\w.-]+", told)
-    here: list[str] = []
-    option = ""
+    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
+    while lines and not lines[0].strip("─-"):  # some terminals have a rule below the title
+        lines.pop(0)
+    first = itertools.takewhile(lambda line: not re.fullmatch("[─-]+", line), lines)
+    told = re.sub(r" \(applied to [^)]*\)| Arguments are applied to the .* matter\.", "", " ".join(first))
+    told = " ".join(told.replace(" or misplaced", "").split()).rstrip(".")
+    given = found[0] if (found := re.search(r"(?<=: )--[\w.-]+", told)) else ""
+    option, here = "", list[str]()
     for line in lines:
         option = found[0] if (found := re.match(r"--[\w.-]+", line)) else option
         if option and line == f"in {place}":
             here.append(option)
-    here.sort(
-        key=lambda name: (
-            (not name.startswith(given[0]), -difflib.SequenceMatcher(None, name, given[0]).ratio()) if given else 0
-        )
-    )
-    return told + _meant(here)
+
+    def close(name: str) -> tuple[bool, float]:
+        return name.startswith(given), difflib.SequenceMatcher(None, name, given).ratio()
+
+    return told + _meant(sorted(here, key=close, reverse=True))
 
 
 def _meant(close: Sequence[str]) -> str:
