@@ -23,7 +23,7 @@ from tutelage.console.accounts import Accounts, Role
 
 PASSWORD = "correct horse battery"
 PEOPLE = {"ada": "admin", "ana": "operator", "ben": "operator", "vic": "viewer"}
-PATIENCE = 60.0
+PATIENCE = 120.0
 """Seconds that a machine that is busy with other things may take for anything."""
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 SWITCHES = (
