@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -80,6 +81,9 @@ def test_run_from_another_process_is_the_run_from_python(folder: Path, tmp_path:
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
+    while lines[0].startswith("preparing: "):
+        lines.pop(0)
+    assert done.stdout.startswith("preparing: recording demonstrations\n")
     assert re.fullmatch(
         r"Walker2d C\.U\.R\.  3/30  \d+ steps/s  successes 0  ROHE 0\.00  falls \d+  humans busy \d/2", lines[0]
     )
@@ -114,6 +118,23 @@ def test_report(tut: Callable[..., Said], folder: Path, tmp_path: Path) -> None:
     assert said.out.splitlines()[-1] == f"report: {tmp_path / 'report.html'}"
     assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
     assert "C.U.R." in said.out
+
+
+def test_a_report_on_all_that_is_there(tut: Callable[..., Said], folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    shutil.copytree(folder, tmp_path / "runs" / "a")
+    shutil.copytree(folder, tmp_path / "runs" / "b")
+    first = tut("report", *(tmp_path / "runs").iterdir())
+    assert first.out.splitlines()[-1] == f"report: {tmp_path / 'runs' / 'report.html'}"
+    again = tut("report", *sorted((tmp_path / "runs").iterdir()))  # with the plots and the page of the first one
+    assert again.out == first.out
+    whole = tut("report", tmp_path / "runs", "--out", tmp_path / "elsewhere")
+    assert whole.out.splitlines()[:-1] == first.out.splitlines()[:-1]
+    assert whole.out.splitlines()[-1] == f"report: {tmp_path / 'elsewhere' / 'report.html'}"
+
+
+def test_a_film_of_a_policy_for_another_task_is_refused(tut: Callable[..., Said], folder: Path) -> None:
+    assert refused(tut("watch", "Navigation", "--run", folder)) == f"{folder} is a run of Walker2d, not of Navigation"
 
 
 def test_info(tut: Callable[..., Said], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,9 +241,12 @@ def refused(said: Said) -> str:
     ("args", "needle"),
     [
         (["run", "Walker2d", "--bogus", "3"], "Unrecognized options: --bogus"),
-        (["run", "Walker2d", "--robot", "3"], "--robots"),
-        (["rnu", "Walker2d"], "rnu"),
-        ([], "{run, resume, evaluate, report, reproduce, train-expert, watch, check, info"),
+        (["run", "Walker2d", "--robot", "3"], "Unrecognized options: --robot, 3 (did you mean --robots?)"),
+        (["run", "Walker2d", "--step", "3"], "(did you mean --steps?)"),
+        (["run", "Walker2d", "--seeds", "3"], "Unrecognized options: --seeds 3 (did you mean --seed?) (see"),
+        (["rnu", "Walker2d"], "unknown command 'rnu' (did you mean run?); commands: run, resume, evaluate, "),
+        (["keys", "reveal"], "unknown command 'reveal' (did you mean revoke?); commands: init, issue, renew, "),
+        ([], "no command given; commands: run, resume, evaluate, report, reproduce, train-expert, watch, check, info"),
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
@@ -250,6 +274,16 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
             ["run", "Walkr2d"],
             f"unknown task 'Walkr2d' (did you mean Walker2d?); tasks: {', '.join(TASKS)}, NutAssemblyRound, "
             "or your own as module:callable",
+        ),
+        (
+            ["run", "Pendulum-v1"],
+            "unknown task 'Pendulum-v1', which looks like an environment of Gymnasium: see `GymnasiumFleet` in "
+            "docs/extending.md; tasks: *",
+        ),
+        (
+            ["run", "small:point_fleet"],
+            "small:point_fleet has no expert: give what makes it an attribute `expert`, or name one: "
+            "tutelage run --expert module:callable",
         ),
         (["run", "nowhere:make"], "task 'nowhere:make': no module 'nowhere'; install it, or run where Python finds it"),
         (
@@ -293,6 +327,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["evaluate", "lost"], "lost holds no run (no config.json); start one with: tutelage run"),
         (["report", "lost"], "lost is not a run folder: no such folder; give a folder that `tutelage run` wrote"),
         (["report", "."], ". is not a run folder: it has no config.json; give a folder that `tutelage run` wrote"),
+        (["watch", "Navigation", "--run", "lost"], "lost holds no run (no config.json); start one with: tutelage run"),
         (["report"], "name at least one run folder, such as: tutelage report runs/*"),
         (["reproduce", "figure-5.3", "--tasks", "Nope"], "unknown task 'Nope'; known tasks: *"),
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import functools
 import io
 import itertools
@@ -52,12 +53,16 @@ def run(config: Annotated[RunConfig, arg(name="")], tensorboard: bool = False) -
         tensorboard: write the metrics for TensorBoard too, into the run folder (extra tensorboard).
     """
     from tutelage.experiments.live import TensorBoard
+    from tutelage.experiments.progress import stages
     from tutelage.experiments.run import Run
 
     if tensorboard:
         TensorBoard.writer()  # before minutes of preparation
     with console.status(f"preparing {config.folder}") as status:
-        prepared = Run.start(config, lambda what, done: status.update(f"{what} {done:.0%}" if done else what))
+        if console.is_terminal:
+            prepared = Run.start(config, lambda what, done: status.update(f"{what} {done:.0%}" if done else what))
+        else:
+            prepared = Run.start(config, stages(lambda line: console.print(line, highlight=False)))
     _go(prepared, tensorboard)
 
 
@@ -112,16 +117,18 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
     """Curves, tables and one self-contained HTML page of one run, or of many with means and 95 % bands.
 
     Args:
-        runs: run folders.
-        out: where the page goes; default: report.html in the only run, or in the folder that holds them all.
+        runs: run folders; or folders of run folders.
+        out: where the page goes, a file.html or a folder; default: report.html in the only run, or in the folder that holds
+            them all.
     """
-    from tutelage.experiments.records import load_runs
+    from tutelage.experiments.records import load_runs, run_folders
     from tutelage.experiments.report import summary_table, write_report
 
     if not runs:
         raise ConfigError("name at least one run folder, such as: tutelage report runs/*")
-    console.print(summary_table(load_runs(runs)), highlight=False, markup=False, soft_wrap=True)
-    page = write_report(runs, out or (runs[0] if len(runs) == 1 else runs[0].parent))
+    folders = run_folders(runs)
+    console.print(summary_table(load_runs(folders)), highlight=False, markup=False, soft_wrap=True)
+    page = write_report(folders, out or (runs[0] if len(runs) == 1 else runs[0].parent))
     console.print(f"report: {page}", highlight=False, soft_wrap=True)
 
 
@@ -407,7 +414,11 @@ def _parse(
 
     verbs: functions, or modules with `VERBS` of their own.
     """
-    group = verbs.get(arguments[0]) if arguments else None
+    if not arguments or not (arguments[0] in verbs or arguments[0].startswith("-")):
+        close = difflib.get_close_matches(arguments[0], verbs, n=1) if arguments else []
+        problem = f"unknown command {arguments[0]!r}{_meant(close)}" if arguments else "no command given"
+        raise ConfigError(f"{problem}; commands: {', '.join(verbs)} (see {prog} --help)")
+    group = verbs.get(arguments[0])
     if isinstance(group, ModuleType):
         return _parse(group.VERBS, arguments[1:], f"{prog} {arguments[0]}", group.__doc__ or "")
 
@@ -439,9 +450,35 @@ def _parse(
     except SystemExit as stop:
         if stop.code != 2:
             raise
-    lines = [line.strip("│╭╮╰╯ ").strip() for line in said.getvalue().splitlines()[1:]]
-    problem = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines)).strip().rstrip(".")
-    meant = re.search(r"Perhaps you meant:\s+(-\S+)", " ".join(lines))
-    hint = f"; did you mean {meant[1]}?" if meant else ""
-    verb = f" {arguments[0]}" if arguments and arguments[0] in verbs else ""
-    raise ConfigError(f"{problem}{hint} (see {prog}{verb} --help)")
+    verb = f" {arguments[0]}" if arguments[0] in verbs else ""
+    raise ConfigError(f"{_problem(said.getvalue(), f'{prog}{verb} --help')} (see {prog}{verb} --help)")
+
+
+def _problem(box: str, place: str) -> str:
+    """What the parser's box says is wrong, as one line; of what it suggests, the option of this place that is closest.
+
+    Args:
+        box: its text.
+        place: the help of the verb, such as "tutelage run --help".
+    """
+    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
+    while lines and not lines[0].strip("─-"):  # some terminals have a rule below the title
+        lines.pop(0)
+    first = itertools.takewhile(lambda line: not re.fullmatch("[─-]+", line), lines)
+    told = re.sub(r" \(applied to [^)]*\)| Arguments are applied to the .* matter\.", "", " ".join(first))
+    told = " ".join(told.replace(" or misplaced", "").split()).rstrip(".")
+    given = found[0] if (found := re.search(r"(?<=: )--[\w.-]+", told)) else ""
+    option, here = "", list[str]()
+    for line in lines:
+        option = found[0] if (found := re.match(r"--[\w.-]+", line)) else option
+        if option and line == f"in {place}":
+            here.append(option)
+
+    def close(name: str) -> tuple[bool, float]:
+        return name.startswith(given), difflib.SequenceMatcher(None, name, given).ratio()
+
+    return told + _meant(sorted(here, key=close, reverse=True))
+
+
+def _meant(close: Sequence[str]) -> str:
+    return f" (did you mean {close[0]}?)" if close else ""

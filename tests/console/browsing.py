@@ -23,6 +23,8 @@ from tutelage.console.accounts import Accounts, Role
 
 PASSWORD = "correct horse battery"
 PEOPLE = {"ada": "admin", "ana": "operator", "ben": "operator", "vic": "viewer"}
+PATIENCE = 120.0
+"""Seconds that a machine that is busy with other things may take for anything."""
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 SWITCHES = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -101,7 +103,7 @@ class Served:
                 self.port = int(found[1])
                 break
         self.origin = f"http://127.0.0.1:{self.port}"
-        until(self._answers, "the server answers", 30)
+        until(self._answers, "the server answers")
 
     def _answers(self) -> bool:
         try:
@@ -135,10 +137,11 @@ class Served:
 
     @staticmethod
     def environment() -> dict[str, str]:
-        return os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        path = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])  # `lasting`
+        return os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", "PYTHONPATH": path}
 
 
-def until(holds: Callable[[], object], what: str, seconds: float = 15.0) -> None:
+def until(holds: Callable[[], object], what: str, seconds: float = PATIENCE) -> None:
     """Wait until something is so."""
     deadline = time.monotonic() + seconds
     while not holds():
@@ -168,7 +171,7 @@ class Person:
         self.context = browser.new_context(**(DESKTOP | options))
         self.context.add_init_script(WATCH)
         self.page = self.context.new_page()
-        self.page.set_default_timeout(15_000)
+        self.page.set_default_timeout(1000 * PATIENCE)
         self.said: deque[str] = deque(maxlen=40)
         self.page.on("websocket", self._listen)
         self.page.on("console", lambda m: m.type in ("error", "warning") and self.complaints.append(f"{m.type}: {m.text}"))
@@ -199,13 +202,18 @@ class Person:
         """To another page of the console."""
         self.page.evaluate("path => { location.hash = path }", path)
 
-    def see(self, selector: str, text: str | re.Pattern[str] | None = None, seconds: float = 15.0) -> Any:
+    def see(self, selector: str, text: str | re.Pattern[str] | None = None, seconds: float = PATIENCE) -> Any:
         """What is on the page; waits for it."""
         found = self.page.locator(selector)
         if text is not None:
             found = found.filter(has_text=text)
         found.first.wait_for(timeout=1000 * seconds)
         return found.first
+
+    def see_picture(self) -> Any:
+        """The large picture of a robot; waits for it. Before, the frame is of another shape."""
+        until(lambda: self.page.evaluate("document.querySelector('.view canvas')?.width ?? 0") > 100, "a picture")
+        return self.page.locator(".view canvas")
 
     def number(self, selector: str) -> int:
         return int(self.page.locator(selector).first.inner_text().replace("\u2009", ""))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 import time
@@ -22,8 +23,8 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def served(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Four robots that find their way through a maze; they know nothing yet."""
-    options = ("--fleet", "sim:Navigation", "--robots", str(ROBOTS), "--humans", "3", "--policy", "none")
+    """Four robots that know nothing yet, in a maze in which no episode ends under the hand of a test."""
+    options = ("--fleet", "sim:lasting:Lasting", "--robots", str(ROBOTS), "--humans", "3", "--policy", "none")
     server = Served(tmp_path_factory.mktemp("page"), *options)
     yield server
     server.close()
@@ -37,16 +38,27 @@ def fresh(served: Served) -> None:
 
 
 def take(somebody: Person, robot: int) -> None:
-    """Take a robot over, whether it asks or not, and set it up where it lies."""
+    """Take a robot over, whether it asks or not."""
     somebody.go(f"/robot/{robot}")
     page = somebody.page
     page.get_by_role("button", name=re.compile("^(Take over|Accept)")).last.click()
     somebody.see(".stage-mine")
-    if page.locator(".driving", has_text="hard reset").count():
-        page.keyboard.press("h")
-        page.get_by_role("dialog").get_by_role("button", name="Reset").click()
-        page.wait_for_selector(".stage-mine", state="detached")
-        take(somebody, robot)
+
+
+def accept(somebody: Person) -> None:
+    """Accept the first offer; one that runs out while the machine is busy comes again."""
+    from playwright.sync_api import Error
+
+    offer, mine = somebody.page.locator(".offer").first, somebody.page.locator(".stage-mine")
+
+    def click() -> int:
+        if not mine.count() and offer.count():
+            with contextlib.suppress(Error):  # it went while it was aimed at
+                offer.get_by_role("button", name="Accept").click(timeout=5000)
+                mine.wait_for(timeout=5000)
+        return int(mine.count())
+
+    until(click, "an offer is accepted")
 
 
 def drive(somebody: Person, key: str = "ArrowRight", seconds: float = 1.0) -> None:
@@ -59,18 +71,11 @@ def drive(somebody: Person, key: str = "ArrowRight", seconds: float = 1.0) -> No
 
 def test_an_operator_helps_and_the_policy_learns_from_it(browser: Any, served: Served) -> None:
     with person(browser, served.origin, "ana") as ana:
-        offer = ana.see(".offer", seconds=60)
+        offer = ana.see(".offer")
         assert re.search("(?i)uncertain|violated", offer.inner_text())
         assert int(ana.page.locator("html").get_attribute("data-chimes")) >= 1
         assert "request" in ana.page.title()
-        offer.get_by_role("button", name="Accept").click()
-        ana.see(".stage-mine")
-        robot = int(ana.page.url.rsplit("/", 1)[1])
-        if ana.page.locator(".driving", has_text="hard reset").count():
-            ana.page.get_by_role("button", name="Hard reset").click()
-            ana.page.get_by_role("dialog").get_by_role("button", name="Reset").click()
-            ana.see(".note", "reset is done")
-            take(ana, robot)
+        accept(ana)
         before = ana.number("[data-testid=policy-version]")
         drive(ana, seconds=0.6)
         ana.see(".driving", "It holds")
@@ -79,7 +84,7 @@ def test_an_operator_helps_and_the_policy_learns_from_it(browser: Any, served: S
         ana.page.get_by_role("button", name="Give back").click()
         ana.see(".note", "You gave it back")
         ana.page.wait_for_selector(".stage-mine", state="detached")
-        until(lambda: ana.number("[data-testid=policy-version]") > before, "the policy's version rises", 30)
+        until(lambda: ana.number("[data-testid=policy-version]") > before, "the policy's version rises")
     with served.client("ana") as http:
         row = next(row for row in http.get("/api/operators").json()["rows"] if row["operator"] == "ana")
         assert row["interventions"] >= 1
@@ -127,6 +132,13 @@ def test_only_one_of_two_gets_a_robot_and_hands_it_over(browser: Any, served: Se
         second.page.wait_for_selector(".stage-mine", state="detached")
 
 
+HEADINGS = """() => {
+  window.__headings = [];
+  const note = () => window.__headings.push(document.querySelector(".stage-head")?.textContent ?? "");
+  new MutationObserver(note).observe(document.body, { subtree: true, childList: true, characterData: true });
+}"""
+
+
 def test_a_closed_tab_leaves_a_robot_that_holds_and_asks_again(browser: Any, served: Served) -> None:
     with person(browser, served.origin, "ben") as ben:
         ben.page.get_by_role("switch").click()  # on a break: nothing is offered to ben
@@ -137,15 +149,17 @@ def test_a_closed_tab_leaves_a_robot_that_holds_and_asks_again(browser: Any, ser
         ana.see(".view-live")
         ben.see(".stage-head", "Driven by ana")
         time.sleep(1.0)
+        ben.page.evaluate(HEADINGS)  # what passes within seconds is noted by the page, not looked for from here
         ana.close()
-        ben.see(".stage-head", re.compile("Holding|Violated"), seconds=5)
-        ben.page.wait_for_function(
-            "() => !document.querySelector('.panel')?.textContent.includes('ana has this robot')", timeout=12_000
-        )
+        until(lambda: ben.page.evaluate("window.__headings.some(text => text.includes('Holding'))"), "the robot holds")
+        ben.page.wait_for_function("() => !document.querySelector('.panel')?.textContent.includes('ana has this robot')")
         ben.see(".waiting-row", "robot 4")
         ben.page.get_by_role("switch").click()
     with served.client("ben") as http:
-        assert any(row["robot"] == 3 and row["operator"] == "ana" for row in http.get("/api/episodes").json()["rows"])
+        until(
+            lambda: any(row["robot"] == 3 and row["operator"] == "ana" for row in http.get("/api/episodes").json()["rows"]),
+            "what ana did can be seen again",
+        )
 
 
 def test_escape_stops_one_robot_then_all_and_going_on_is_confirmed(browser: Any, served: Served) -> None:
@@ -156,8 +170,13 @@ def test_escape_stops_one_robot_then_all_and_going_on_is_confirmed(browser: Any,
         ana.page.wait_for_selector(".stage-mine", state="detached")
         time.sleep(1.0)
         assert ana.page.locator(".banner-stop").count() == 0
-        ana.page.keyboard.press("Escape")
-        ana.page.keyboard.press("Escape")
+
+        def twice() -> int:
+            ana.page.keyboard.press("Escape")
+            ana.page.keyboard.press("Escape")
+            return int(ana.page.locator(".banner-stop").count())
+
+        until(twice, "Esc twice stops all")  # again where the machine was too busy for two presses within 0.8 s
         ana.see(".banner-stop", "All robots are stopped")
         ana.page.locator(".clear-stop").click()
         ana.page.get_by_role("dialog").wait_for()
@@ -195,20 +214,16 @@ def test_keys_alone_do_everything(browser: Any, served: Served) -> None:
                 assert ana.page.evaluate(outline) == "solid2px"
         for reached in ("Charts", "Emergency stop", "Available", "robot 1"):
             assert any(reached in text for text in seen), reached
-        ana.see(".offer", seconds=60)
-        keys.press("a")
-        ana.see(".stage-mine")
-        assert ana.page.evaluate("document.activeElement.getAttribute('role')") == "application"
-        if ana.page.locator(".driving", has_text="hard reset").count():
-            keys.press("h")
-            ana.page.get_by_role("dialog").wait_for()
-            keys.press("Enter")
-            ana.see(".note", "reset is done")
-            ana.see(".offer", seconds=60)
-            keys.press("a")
-            ana.see(".stage-mine")
-        if not ana.page.locator(".driving", has_text="hard reset").count():
-            drive(ana, "ArrowUp", 0.5)
+
+        def press() -> int:
+            if ana.page.locator(".offer").count():
+                keys.press("a")
+            return int(ana.page.locator(".stage-mine").count())
+
+        until(press, "an offer is accepted")
+        role = "document.activeElement.getAttribute('role')"
+        until(lambda: ana.page.evaluate(role) == "application", "the picture has the keys")
+        drive(ana, "ArrowUp", 0.5)
         keys.press("g")
         ana.page.wait_for_selector(".stage-mine", state="detached")
 
@@ -241,7 +256,7 @@ def test_a_thumb_drives_on_a_phone(browser: Any, served: Served) -> None:
 def test_a_press_on_the_picture_drives(browser: Any, served: Served) -> None:
     with person(browser, served.origin, "ana") as ana:
         take(ana, 1)
-        box = ana.page.locator(".view canvas").bounding_box()
+        box = ana.see_picture().bounding_box()
         assert box is not None
         ana.page.mouse.move(box["x"] + box["width"] * 0.4, box["y"] + box["height"] * 0.5)
         ana.page.mouse.down()
@@ -302,7 +317,7 @@ def test_the_large_picture_may_come_by_webrtc(browser: Any, served: Served) -> N
         until(lambda: vic.page.evaluate("document.querySelector('.view video')?.videoWidth ?? 0") > 100, "a picture")
         vic.see(".hud", "Last picture")
         vic.page.locator("input[name=way]").first.check(force=True)
-        until(lambda: vic.page.evaluate("document.querySelector('.view canvas')?.width ?? 0") > 100, "a picture")
+        vic.see_picture()
 
 
 def test_viewers_look_and_do_nothing(browser: Any, served: Served) -> None:
@@ -312,7 +327,7 @@ def test_viewers_look_and_do_nothing(browser: Any, served: Served) -> None:
         assert vic.page.get_by_role("button", name=re.compile("stop|Take over", re.I)).count() == 0
         assert vic.page.get_by_role("link", name="Audit").count() == 0
         assert vic.page.get_by_role("link", name="Accounts").count() == 0
-        until(lambda: vic.page.evaluate("document.querySelector('.view canvas').width") > 100, "a picture")
+        vic.see_picture()
 
 
 def test_every_page_shows_what_happened(browser: Any, served: Served) -> None:
@@ -420,12 +435,30 @@ def test_many_robots_are_watched_only_where_they_are_seen(browser: Any, served: 
         page.reload()
         page.wait_for_selector(".tile")
         page.locator("input[name=size]").last.check()
-        page.wait_for_timeout(1500)
-        last = [said for said in asked if '"watch"' in said][-1]
-        assert 1 <= last.count('"robot"') < ROBOTS
+
+        def watched() -> str:
+            page.wait_for_timeout(100)
+            return next((said for said in reversed(asked) if '"watch"' in said), "")
+
+        until(lambda: 1 <= watched().count('"robot"') < ROBOTS, "only some are watched")
         ana.go("/charts")
-        page.wait_for_timeout(1000)
-        assert '"streams":[]' in [said for said in asked if '"watch"' in said][-1]
+        until(lambda: '"streams":[]' in watched(), "none is watched")
+
+
+def test_a_robot_in_violation_is_set_up_again(browser: Any, served: Served) -> None:
+    """Late in this file, as the policy learns from it where to fall."""
+    with person(browser, served.origin, "ana") as ana:
+        take(ana, 1)
+        ana.page.keyboard.down("ArrowLeft")
+        ana.see(".stage-head", "Violated")
+        ana.page.keyboard.up("ArrowLeft")
+        if not ana.page.locator(".stage-mine").count():  # its episode ended, and with it what ana had of it
+            take(ana, 1)
+        ana.see(".driving", "It needs a hard reset")
+        ana.page.keyboard.press("h")
+        ana.page.get_by_role("dialog").get_by_role("button", name="Reset").click()
+        ana.see(".note", "reset is done")
+        ana.page.wait_for_selector(".stage-mine", state="detached")
 
 
 def test_the_page_comes_back_when_the_server_does(browser: Any, served: Served) -> None:
@@ -433,13 +466,13 @@ def test_the_page_comes_back_when_the_server_does(browser: Any, served: Served) 
     try:
         take(somebody, 0)
         served.kill()
-        somebody.see(".banner-bad", "connection to the server is lost", seconds=10)
         somebody.see(".note", "the robot holds")
+        somebody.see(".banner-bad", "connection to the server is lost")
         assert somebody.page.locator(".stage-mine").count() == 0
         again = threading.Thread(target=served.start)
         again.start()
-        again.join(60)
-        somebody.page.wait_for_selector(".banner-bad", state="detached", timeout=30_000)
+        again.join(120)
+        somebody.page.wait_for_selector(".banner-bad", state="detached")
         somebody.see(".link:not(.link-bad)")
     finally:
         somebody.close()

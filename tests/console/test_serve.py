@@ -140,6 +140,7 @@ def test_one_folder_has_one_server(tmp_path: Path, serving: list[Served]) -> Non
      (["--origin", "https://robots.example"], "make an account first: tutelage accounts add NAME --role admin --out "),
      (["--host", "no.such.name.invalid"], "no.such.name.invalid is not this machine's own address"),
      (["--port", "99999"], "cannot listen on 127.0.0.1 port 99999"),
+     (["--fleet", "Navigation"], "unknown fleet 'Navigation' (did you mean sim:Navigation?)"),
      (["--fleet", "sim:NoSuchTask"], "NoSuchTask")],
 )  # fmt: skip
 def test_what_cannot_be_served_is_one_clear_line(tmp_path: Path, options: list[str], why: str) -> None:
@@ -147,6 +148,15 @@ def test_what_cannot_be_served_is_one_clear_line(tmp_path: Path, options: list[s
     assert said.returncode == 2
     assert said.stderr.count("\n") == 1
     assert why in said.stderr
+
+
+def test_a_run_that_was_not_served_is_left_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    said = tutelage(*SERVE, "--out", tmp_path)
+    assert said.stderr == (
+        f"tutelage: {tmp_path} holds a run that was not served; choose another --out, or give it as --policy\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
 
 
 def test_a_port_that_is_taken_is_told_before_anything_is_prepared(tmp_path: Path) -> None:

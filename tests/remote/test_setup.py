@@ -70,7 +70,7 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["fleet", "policy", "arm-1", "--server", "office"])
     assert Policy.parse(capsys.readouterr().out).topics["arm-1.stop"].may_send("office")
     for words, says in (
-        (["fleet", "new", str(folder)], "holds the authority of a fleet already"),
+        (["fleet", "new", str(folder)], "is not empty; choose another folder"),
         (["fleet", "new", str(tmp_path / "b"), "--robots", "0"], "1 to 10,000 robots"),
         (["robot", str(tmp_path / "nowhere"), "--env", "Navigation"], "no node's home"),
         (["robot", str(folder / "robot-1"), "--env", "Nothing"], "unknown task 'Nothing'"),

@@ -147,7 +147,10 @@ def test_what_is_shown_holds_no_secret(keys: Keys) -> None:
         ("init x --node a --root missing.pem", "no root certificate missing.pem"),
         ("init x --fleet acme --passphrase-file missing", "cannot read missing: No such file"),
         ("issue x", "x is no fleet's authority"),
-        ("renew x", "x is no node's home (no node.json); make one: tutelage keys init x --node NAME"),
+        (
+            "renew x",
+            "x is no node's home (no node.json); make one: tutelage keys init x --node NAME (a router's: --router NAME)",
+        ),
         ("revoke x a", "x is no fleet's authority"),
         ("show x", "x is no node's home"),
         ("serve x y", "x is no fleet's authority"),

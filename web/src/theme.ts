@@ -38,7 +38,12 @@ export function setTheme(next: Theme): void {
 apply();
 window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", apply);
 
-/** A colour of the style sheet. */
+/** A colour of the style sheet as it is now, light or dark: what a property holds is not yet decided, what an element has is. */
 export function colour(name: string): string {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const probe = document.createElement("i");
+  probe.style.color = `var(${name})`;
+  document.body.append(probe);
+  const found = getComputedStyle(probe).color;
+  probe.remove();
+  return found;
 }

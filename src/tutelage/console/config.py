@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tutelage.console.offers import Terms
+from tutelage.envs.tasks import TASKS
 from tutelage.errors import ConfigError
 
 
@@ -17,7 +18,7 @@ class EngineConfig:
     Attributes:
         fleet: "sim:TASK" (a task or "module:function"), or "net:HOME", remote robots of a home made by `tutelage keys`.
         robots: N of a simulated fleet.
-        humans: M, seats for operators.
+        humans: seats for operators; M is at most one a robot.
         priority: p-hat.
         queue: who is next, see `RunConfig`.
         wait: robots that need somebody stand still until a person comes, see `RunConfig`.
@@ -65,7 +66,8 @@ class EngineConfig:
     def __post_init__(self) -> None:
         kind, _, name = self.fleet.partition(":")
         if kind not in ("sim", "net") or not name:
-            raise ConfigError(f"unknown fleet {self.fleet!r}: write sim:TASK or net:HOME")
+            meant = f" (did you mean sim:{self.fleet}?)" if self.fleet in TASKS else ""
+            raise ConfigError(f"unknown fleet {self.fleet!r}{meant}: write sim:TASK or net:HOME")
         if not 0.1 <= self.hz <= 1000:
             raise ConfigError(f"hz must be from 0.1 to 1000, got {self.hz}")
         if self.humans < 1 or self.robots < 1:
@@ -79,6 +81,10 @@ class EngineConfig:
     def task(self) -> str:
         """The name of the task, or of the home."""
         return self.fleet.partition(":")[2]
+
+    def seats(self, robots: int) -> int:
+        """M, for so many robots."""
+        return min(self.humans, robots)
 
     @property
     def simulated(self) -> bool:

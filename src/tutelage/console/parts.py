@@ -69,6 +69,12 @@ def learner_path(folder: Path) -> Path:
     return folder / "checkpoint" / "learner.safetensors"
 
 
+def check_folder(folder: Path) -> None:
+    """Raises RunFolderError where a folder holds a run that was not served."""
+    if (folder / "config.json").exists() and not (folder / SERVED).exists():
+        raise RunFolderError(f"{folder} holds a run that was not served; choose another --out, or give it as --policy")
+
+
 def make_parts(config: EngineConfig, report: Report) -> Parts:
     """Make the parts, new or as the folder has them. Prepares a policy where there is none yet, which takes a while.
 
@@ -77,10 +83,9 @@ def make_parts(config: EngineConfig, report: Report) -> Parts:
         ConfigError: a fleet, task or combination that cannot work.
     """
     folder = config.out
+    check_folder(folder)
     if (folder / SERVED).exists():
         return _again(config)
-    if (folder / "config.json").exists():
-        raise RunFolderError(f"{folder} holds a run that was not served; choose another --out, or give it as --policy")
     parts = (_simulated if config.simulated else _remote)(config, report)
     folder.mkdir(parents=True, exist_ok=True)
     save_learner(folder, parts.learner, seen=0, version=0)
@@ -143,7 +148,7 @@ def _served(folder: Path) -> dict[str, Any]:
 
 
 def _simulated(config: EngineConfig, report: Report) -> Parts:
-    run = _run_config(config)
+    run = _run_config(config, config.robots)
     trained = config.policy if config.policy not in (None, "none") else None
     if trained:
         before = read_config(Path(trained))
@@ -171,10 +176,10 @@ def _simulated(config: EngineConfig, report: Report) -> Parts:
 def _remote(config: EngineConfig, report: Report) -> Parts:
     """Real robots. Where they work at a task that can be simulated, its algorithmic human gives the first demonstrations."""
     fleet = _connect(config)
-    run = dataclasses.replace(_run_config(config), task=fleet.description.task, robots=fleet.num_envs)  # type: ignore[attr-defined]
     try:
+        run = dataclasses.replace(_run_config(config, fleet.num_envs), task=fleet.description.task)  # type: ignore[attr-defined]
         if (config.policy is None and run.task in TASKS) or config.policy not in (None, "none"):
-            small = dataclasses.replace(config, fleet=f"sim:{run.task}", robots=config.humans)
+            small = dataclasses.replace(config, fleet=f"sim:{run.task}", robots=run.humans)
             assembly = _simulated(small, report).assembly
             config_of = dataclasses.replace(assembly.config, robots=fleet.num_envs)
             assembly.fleet.close()
@@ -219,7 +224,8 @@ def _again(config: EngineConfig) -> Parts:
     """The parts of a folder that was served before."""
     folder = config.out
     served, run = _served(folder), dataclasses.replace(read_config(folder), out=folder)
-    wanted = (config.fleet, config.humans, config.robots if config.simulated else run.robots, config.priority)
+    robots = config.robots if config.simulated else run.robots
+    wanted = (config.fleet, config.seats(robots), robots, config.priority)
     if wanted != (served.get("fleet"), run.humans, run.robots, run.priority):
         raise RunFolderError(
             f"{folder} was served with --fleet {served.get('fleet')} --robots {run.robots} --humans {run.humans} "
@@ -237,10 +243,10 @@ def _again(config: EngineConfig) -> Parts:
     return Parts(assembly.config, fleet, assembly, expert, resumed=True)
 
 
-def _run_config(config: EngineConfig) -> RunConfig:
+def _run_config(config: EngineConfig, robots: int) -> RunConfig:
     settings: dict[str, Any] = {
-        "task": config.task, "priority": config.priority, "robots": config.robots,
-        "humans": config.humans, "steps": 10**9, "seed": config.seed, "t_reset": config.t_reset,
+        "task": config.task, "priority": config.priority, "robots": robots,
+        "humans": config.seats(robots), "steps": 10**9, "seed": config.seed, "t_reset": config.t_reset,
         "queue": config.queue, "wait": config.wait, "record": "none", "out": config.out,
         "metrics_every": max(1, round(config.hz)),
     }  # fmt: skip

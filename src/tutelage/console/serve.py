@@ -32,6 +32,7 @@ from tutelage.console.limits import is_loopback
 from tutelage.console.messages import LONGEST
 from tutelage.console.protocol import PatientProtocol
 from tutelage.console.security import App, Site
+from tutelage.console.terminal import Terminal
 
 if TYPE_CHECKING:
     from tutelage.console.study import Study
@@ -82,7 +83,9 @@ class WebConfig:
         try:
             ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{self.certificate} and {self.key} cannot be used: {error}") from None
+            raise ConfigError(
+                f"{self.certificate} and {self.key} cannot be used: {getattr(error, 'strerror', None) or error}"
+            ) from None
 
 
 def uvicorn_config(app: App, host: str, port: int, **options: Any) -> uvicorn.Config:
@@ -160,6 +163,7 @@ def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, w
         files = {"ssl_certfile": web.certificate, "ssl_keyfile": web.key} if site.tls else {}
         server = Server(uvicorn_config(app, web.host, web.port, **files))
         if not study:
+            supervision.subscribe(Terminal(supervision.description.robots, say).hear)
             supervision.start()
         audit.write("server", "server", action="start", pid=os.getpid())
         _greet(say, site, listening, invitation)

@@ -26,6 +26,8 @@ def study_table(folder: Path) -> str:
         result = read_result(path)
         by_participant.setdefault(int(result["seed"]), []).append(result)
     complete = {p: results for p, results in by_participant.items() if len(results) == len(CONDITIONS)}
+    if not folder.is_dir():
+        raise ConfigError(f"there is no folder {folder}; give the one that `tutelage study run` wrote (--out)")
     if not complete:
         raise ConfigError(f"no participant of {folder} went through all conditions yet: tutelage study run --help")
     results = [result for p in sorted(complete) for result in complete[p]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import re
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -85,6 +86,8 @@ def find_task(task: str) -> Callable[..., Any]:
     close = difflib.get_close_matches(task.lower(), [name.lower() for name in names])
     meant = [name for name in names if name.lower() in close]
     hint = f" (did you mean {' or '.join(meant)}?)" if meant else ""
+    if re.search(r"-v\d+$", task):
+        hint = ", which looks like an environment of Gymnasium: see `GymnasiumFleet` in docs/extending.md"
     raise ConfigError(f"unknown task {task!r}{hint}; tasks: {', '.join(names)}, or your own as module:callable")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -10,6 +11,25 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.step import Step
 from tutelage.fleet.tally import Tally
+
+
+def stages(say: Callable[[str], None], seconds: float = 10.0) -> Callable[[str, float], None]:
+    """What tells of a preparation in few lines: each stage as it begins, and how far it is every so many seconds.
+
+    Args:
+        say: takes a line.
+        seconds: between two lines of a stage.
+    """
+    stage, due = "", 0.0
+
+    def report(what: str, done: float) -> None:
+        nonlocal stage, due
+        now = time.monotonic()
+        if what != stage or now >= due:
+            stage, due = what, now + seconds
+            say(f"preparing: {what}" + (f" {done:.0%}" if 0 < done < 1 else ""))
+
+    return report
 
 
 class ProgressDisplay:

@@ -111,6 +111,27 @@ def load_run(path: Path | str) -> RunRecord:
     return RunRecord(path, config, metrics, log, evaluation)
 
 
+def run_folders(paths: Sequence[Path | str]) -> list[Path]:
+    """The run folders that are meant: each path itself, or those in it. What a report left beside them is passed over.
+
+    Raises:
+        RunFolderError: a path is no run folder, and holds none.
+    """
+    found: dict[Path, None] = {}
+    for path in map(Path, paths):
+        within = [one.parent for one in sorted(path.glob("*/config.json"))]
+        if (path / "config.json").is_file() or not within:
+            if len(paths) > 1 and (path.name == "report.html" or _holds_only(path, "curves.png")):
+                continue
+            within = [path]
+        found |= dict.fromkeys(within)
+    return list(found)
+
+
+def _holds_only(folder: Path, name: str) -> bool:
+    return folder.is_dir() and [entry.name for entry in folder.iterdir()] == [name]
+
+
 def load_runs(paths: Sequence[Path | str]) -> list[RunRecord]:
     """Read run folders, at least one."""
     if not paths:

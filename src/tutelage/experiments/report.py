@@ -159,7 +159,7 @@ def write_report(paths: Sequence[Path | str], out: Path | str) -> Path:
 
     Args:
         paths: run folders, at least one.
-        out: the file; or a folder, then `report.html` in it.
+        out: a file whose name ends in .html; or a folder, then `report.html` in it.
 
     Returns:
         The file.
@@ -169,7 +169,7 @@ def write_report(paths: Sequence[Path | str], out: Path | str) -> Path:
         MissingExtraError: matplotlib is not installed.
     """
     runs, out = load_runs(paths), Path(out)
-    out = out / "report.html" if out.is_dir() else out
+    out = out if out.suffix == ".html" and not out.is_dir() else out / "report.html"
     light, dark = (render(curves(runs, dark, titled=False), "svg") for dark in (False, True))
     page = "".join(_page(runs, light, dark))
     save(curves(runs), out.parent / "plots" / "curves.png")

@@ -18,6 +18,7 @@ from tyro.conf import Positional
 from tutelage.envs import experts
 from tutelage.envs.registry import make_fleet
 from tutelage.errors import ConfigError, MissingExtraError, TutelageError
+from tutelage.experiments.run import read_config
 from tutelage.fleet.fleet import Fleet
 from tutelage.fleet.policy import Policy
 from tutelage.policies.ensemble import EnsemblePolicy
@@ -85,6 +86,8 @@ def watch(config: WatchConfig) -> Path:
         TutelageError: no OpenGL, or no ffmpeg.
     """
     sheet = config.path.suffix == ".png"
+    if config.run and (before := read_config(config.run)).task != config.task:
+        raise ConfigError(f"{config.run} is a run of {before.task}, not of {config.task}")
     policy = EnsemblePolicy.load(config.run / "policy.safetensors")[0] if config.run else experts.load(config.task)[0]
     settings: dict[str, Any] = (
         {"observation": "images"} if isinstance(policy, EnsemblePolicy) and len(policy.obs_shape) == 3 else {}

@@ -238,6 +238,7 @@ def parse(text: str, config: PriorityConfig | None = None, gate: GateConfig | No
         raise ConfigError(
             f"cannot read the priority {text!r}: use different terms of {', '.join(TERMS)} with dots, such as C.U.R., "
             f"or one of {', '.join(GATES)}"
+            + ("; a callable of yours goes into a Loop (docs/extending.md)" if ":" in text else "")
         )
     if len(names) == 1 and names[0] in GATES:
         names.append("C")

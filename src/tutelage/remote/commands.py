@@ -121,6 +121,8 @@ def new(
 
     if not 1 <= robots <= 10_000:
         raise ConfigError(f"a fleet has 1 to 10,000 robots, not {robots}")
+    if folder.exists() and not (folder.is_dir() and next(folder.iterdir(), None) is None):
+        raise ConfigError(f"{folder} is not empty; choose another folder")
     made = new_fleet(folder, robots, connect=connect, cameras=cameras, name=name, hours=hours)
     port = connect.rpartition(":")[2]
     protocol = connect.partition("/")[0]

@@ -48,7 +48,7 @@ def new_fleet(
     """Make a fleet: an authority, a router, a server, and robots, each with a home of its own.
 
     Args:
-        folder: empty, or not there yet.
+        folder: where; holds no fleet yet.
         robots: how many, or their names.
         connect: where the router will be reached, protocol/host:port.
         cameras: names of each robot's cameras.

@@ -60,7 +60,8 @@ class Home:
             self.signing_key, self.sealing_key = load_signing_key(self.key_file), load_sealing_key(path / "sealing.key")
         except FileNotFoundError as error:
             raise KeysError(
-                f"{path} is no node's home (no {Path(error.filename).name}); make one: tutelage keys init {path} --node NAME"
+                f"{path} is no node's home (no {Path(error.filename).name}); make one: "
+                f"tutelage keys init {path} --node NAME (a router's: --router NAME)"
             ) from None
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise KeysError(f"{path} is damaged: {error}; restore it, or revoke the node and make a new home") from None

@@ -57,8 +57,13 @@ export function Login({ setup }: Props) {
         </label>
         <label class="field-label">
           Password
-          <input type="password" name="password" autocomplete={setup ? "new-password" : "current-password"} required value={password} onInput={(event) => setPassword(event.currentTarget.value)} />
+          <input type="password" name="password" autocomplete={setup ? "new-password" : "current-password"} required value={password} aria-describedby={setup ? "password-rule" : undefined} onInput={(event) => setPassword(event.currentTarget.value)} />
         </label>
+        {setup ? (
+          <p class="quiet" id="password-rule">
+            At least 10 characters.
+          </p>
+        ) : null}
         <p class="error-line" role="alert">
           {error ? (wait > 0 ? `${error} Try again in ${wait} s.` : error) : ""}
         </p>

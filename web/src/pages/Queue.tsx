@@ -91,11 +91,15 @@ function Row({ row }: { row: QueueRow }) {
   );
 }
 
+/** Why nobody asks: all is well, or nobody can. */
 function Nobody() {
+  const { offline, stopped } = tally.value;
+  const count = robots.value.length;
+  const silent = !snapshot.value ? "Waiting for the fleet…" : offline === count ? "No robot can be reached." : offline + stopped === count ? "No robot asks: they are stopped." : null;
   return (
     <p class="nobody">
-      {snapshot.value ? "No robot needs help." : "Waiting for the fleet…"}
-      {canOperate.value && snapshot.value ? <span class="quiet"> A chime will call you.</span> : null}
+      {silent ?? "No robot needs help."}
+      {canOperate.value && !silent ? <span class="quiet"> A chime will call you.</span> : null}
     </p>
   );
 }

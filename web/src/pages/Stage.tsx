@@ -277,7 +277,7 @@ function Actions({ index, mine }: { index: number; mine: boolean }) {
           <strong>{resetting ? "Resetting" : fallen ? "It needs a hard reset" : robot.held ? "It holds: press something" : "You drive"}</strong>
           {since !== undefined && !fallen ? <span class="num">{clock(store.now.value + store.clockSync.offset - since)}</span> : null}
         </p>
-        {fallen ? <p class="quiet">It violated its constraint and stands still. It can be driven when it has been reset.</p> : null}
+        {fallen ? <p class="quiet">It violated its constraint and stands still. After the reset it goes on by itself; take it over again if it needs more.</p> : null}
         <div class="action-grid">
           <button type="button" class={`button ${fallen ? "" : "primary"}`} disabled={resetting} onClick={() => void giveBack(index)} aria-keyshortcuts={keyLabel(giveBackKey())}>
             Give back <kbd>{keyLabel(giveBackKey())}</kbd>
@@ -303,7 +303,7 @@ function Actions({ index, mine }: { index: number; mine: boolean }) {
           <button
             type="button"
             class="button primary"
-            disabled={asked || store.lease.value !== null || !robot.online || robot.stopped || store.me.value?.seat === null}
+            disabled={asked || store.connection.value.kind !== "open" || store.lease.value !== null || !robot.online || robot.stopped || store.me.value?.seat === null}
             onClick={() => void takeOver(index)}
           >
             {asked ? "Waiting for it…" : offered ? "Accept" : "Take over"} {offered ? <kbd>A</kbd> : null}

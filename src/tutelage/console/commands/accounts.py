@@ -123,8 +123,10 @@ def _password(name: str, file: Path | None) -> str:
     if file is not None:
         try:
             lines = file.read_text().splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"cannot read {file}: {error}") from None
+        except OSError as error:
+            raise ConfigError(f"cannot read {file}: {error.strerror}") from None
+        except UnicodeDecodeError:
+            raise ConfigError(f"cannot read {file}: not text") from None
         return lines[0] if lines else ""
     if not sys.stdin.isatty():
         return sys.stdin.readline(1024).rstrip("\r\n")

@@ -33,7 +33,7 @@ def serve(
     Args:
         fleet: sim:TASK (see tutelage info; or sim:module:function), or net:HOME, remote robots (see tutelage robot).
         robots: N of a simulated fleet.
-        humans: M, seats for operators.
+        humans: M, seats for operators, at most one a robot.
         priority: which robots ask for help, such as C.U.R.
         queue: who is next: the neediest robot, or the one that asked first.
         hz: timesteps a second.
@@ -54,20 +54,22 @@ def serve(
     web = WebConfig(host, port, certificate, key, origin)
     web.check()
     from tutelage.console.config import EngineConfig
+    from tutelage.console.parts import check_folder
     from tutelage.console.supervision import Supervision
+    from tutelage.experiments.progress import stages
 
     engine = EngineConfig(
         fleet=fleet, robots=robots, humans=humans, priority=priority, queue=queue, hz=hz, lockstep=lockstep, policy=policy,
         learner=learner, seed=seed, out=out,
     )  # fmt: skip
 
+    check_folder(out)
+
     def say(line: str) -> None:
         print(line, flush=True)
 
-    def report(what: str, done: float) -> None:
-        say(f"{what} {done:.0%}" if done else what)
-
     def open_supervision(audit: Audit) -> Supervision:
-        return Supervision.open(engine, audit, report)
+        say(f"opening {fleet}")
+        return Supervision.open(engine, audit, stages(say))
 
     run(open_supervision, out, web, say)

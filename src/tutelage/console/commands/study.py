@@ -46,17 +46,15 @@ def run(
     web.check()
     from tutelage.console.study import Study
     from tutelage.console.study_parts import StudyConfig
+    from tutelage.experiments.progress import stages
 
     config = StudyConfig(participant, out, hz, steps, practice)
 
     def say(line: str) -> None:
         print(line, flush=True)
 
-    def report(what: str, done: float) -> None:
-        say(f"{what} {done:.0%}" if done else what)
-
     def open_study(audit: Audit) -> Study:
-        return Study(config, audit, report)
+        return Study(config, audit, stages(say))
 
     serve(open_study, out, web, say)
 

@@ -80,6 +80,11 @@ def load(task: str, path: Path | None = None) -> tuple[Policy, dict[str, Any]]:
         scores = path_of(task)
         card = json.loads(scores.read_text()) if scores.exists() else {"task": task, "scores": {}}
         return run_program(program), card
+    if path is None and ":" in task:
+        raise ConfigError(
+            f"{task} has no expert: give what makes it an attribute `expert`, or name one: "
+            "tutelage run --expert module:callable"
+        )
     path = path or path_of(task)
     if not path.exists():
         raise ConfigError(f"no expert at {path}; train one with: tutelage train-expert {task}")
