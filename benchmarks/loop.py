@@ -116,6 +116,11 @@ class RawGradients:
             self.learner.update(t)
 
 
+def share() -> None:
+    """Let all cores share a matrix product, as PyTorch would by itself."""
+    torch.set_num_threads(default_torch_threads())
+
+
 def watch(ours: Ours) -> Phases:
     """Time the phases of a loop from now on."""
     phases, loop = Phases(), ours.loop
@@ -169,7 +174,6 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         (data.obs.rows[:OFFLINE].numpy(), data.actions.rows[:OFFLINE].numpy()), PRETRAIN, moved.counts.append,
     )  # fmt: skip
     original.run(WARM)
-    share: Callable[[], None] = lambda: torch.set_num_threads(default_torch_threads())  # noqa: E731 - PyTorch's own choice
     for counter in (lockstep.moved, overlap.moved, moved):
         counter.counts.clear()
 
@@ -184,7 +188,7 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
             }, rounds, before={
                 "original": share, "ours": lockstep.threads, "ours, overlap": overlap.threads,
                 "ours, bfloat16": low.threads, "overlap, bfloat16": low_overlap.threads,
-                "raw physics": physics.rewind, "raw gradients": lockstep.threads,
+                "raw physics": physics.rewind, "raw gradients": share,
             },
         )  # fmt: skip
     finally:
@@ -206,6 +210,6 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         "threads": {
             "physics": lockstep.loop.fleet.physics.threads,  # type: ignore[attr-defined]
             "torch": lockstep.torch_threads,
-            "torch, original": default_torch_threads(),
+            "torch, original and raw gradients": default_torch_threads(),
         },
     }

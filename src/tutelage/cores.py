@@ -17,6 +17,12 @@ def default_torch_threads() -> int:
     return min(4, available_cores())
 
 
+def cores_beside_learning() -> int:
+    """Threads of physics while one thread learns: of three cores and more, that one is left alone."""
+    cores = available_cores()
+    return cores - 1 if cores > 2 else cores
+
+
 def keep_freed_memory() -> None:
     """Let this process keep up to 64 MiB that it freed, where its C library is glibc.
 

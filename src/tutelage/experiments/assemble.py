@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tutelage.cores import default_torch_threads, keep_freed_memory
+from tutelage.cores import cores_beside_learning, default_torch_threads, keep_freed_memory
 from tutelage.envs import experts
 from tutelage.envs.registry import find_task, make_fleet
 from tutelage.envs.task_fleet import TaskFleet
@@ -40,6 +40,10 @@ from tutelage.policies.networks import hidden_layers, stored_as
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
+
+
+MANY = 400
+"""Robots from which on products of matrices are large enough for several threads, and physics is most of a step."""
 
 
 @dataclass
@@ -195,16 +199,12 @@ def learner_of(config: RunConfig, shape: tuple[int, ...], low: Array, high: Arra
             policy, dataset, stream(config.seed, "classifier"), derive(config.seed, "classifier/initial weights"),
             beta_h=np.nan if config.gate.beta_h is None else config.gate.beta_h, batch=config.learner.batch,
         )  # fmt: skip
-    threads = 1 if _share_products(config, shape) else config.torch_threads or 1
-    return ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed, threads)
+    return ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed)
 
 
 def _share_products(config: RunConfig, shape: tuple[int, ...]) -> bool:
-    """Whether threads share each matrix product. It pays for images and for many robots; for others, meeting costs more.
-
-    There, networks learn side by side instead, see `Descent`.
-    """
-    return len(shape) == 3 or config.robots > 400
+    """Whether threads share each matrix product. It pays for images and for many robots; for others, meeting costs more."""
+    return len(shape) == 3 or config.robots > MANY
 
 
 def fleet_of(config: RunConfig, num_envs: int, level: str | None, **settings: Any) -> Fleet:
@@ -246,6 +246,9 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
     if config.torch_threads is None:
         changes["torch_threads"] = default_torch_threads()
+    always = config.learner.schedule == "step" and config.learner.every == 1
+    if config.threads is None and task and always and config.robots <= MANY:
+        changes["threads"] = cores_beside_learning()
     if set(config.priority.split(".")) <= {"C", ""}:
         # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).
         changes["learner"] = dataclasses.replace(config.learner, schedule="never")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,7 +74,8 @@ class DiscrepancyClassifier:
             obs = torch.cat([data.obs.rows[torch.from_numpy(rows)] for data, rows in parts])
             actions = torch.cat([data.actions.rows[torch.from_numpy(rows)] for data, rows in parts])
             unsafe = torch.from_numpy(self.discrepancies(obs.numpy(), actions.numpy()) >= self.beta_h).float()
-            loss = self.descent.step(partial(self._loss, obs, unsafe))
+            losses = torch.nn.functional.binary_cross_entropy_with_logits(self._logit(obs), unsafe)[None]
+            loss = self.descent.step(losses)
         self.policy.forget()
         return loss
 
@@ -95,9 +95,6 @@ class DiscrepancyClassifier:
                 f"choose a {move} beta_h",
                 stacklevel=2,
             )
-
-    def _loss(self, obs: torch.Tensor, unsafe: torch.Tensor, *_: Any) -> torch.Tensor:
-        return torch.nn.functional.binary_cross_entropy_with_logits(self._logit(obs), unsafe)[None]
 
     def _logit(self, obs: torch.Tensor) -> torch.Tensor:
         return self.net(self.policy.normalise(obs))[0, :, 0]  # type: ignore[no-any-return]

@@ -188,7 +188,7 @@ class Critic:
             then = torch.from_numpy(np.asarray(self.policy.act(after.numpy()), np.float32))
             future = self._worst(self._q(self.target, after, then))
             y[: len(after)] = self.config.gamma * (1 - end) * future
-        loss = self.descent.step(lambda net, _: (self._q(net, batch["obs"], batch["action"]) - y).square().mean(dim=1))
+        loss = self.descent.step((self._q(self.net, batch["obs"], batch["action"]) - y).square().mean(dim=1))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.target.parameters()), list(self.net.parameters()), self.config.tau)
         return loss

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tutelage.errors import ConfigError
 from tutelage.fleet.step import Step
@@ -19,7 +17,6 @@ from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.descent import Descent
 from tutelage.policies.ensemble import EnsemblePolicy
-from tutelage.policies.networks import Network
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import derive
 
@@ -69,7 +66,6 @@ class ImitationLearner:
         critics: by the name of the signal they estimate: "risk" or "goal".
         classifier: f of SafeDAgger, updated whenever the policy is.
         seed: root seed, for new initial weights.
-        threads: in which the members of the ensemble learn, see `Descent`.
     """
 
     def __init__(
@@ -80,11 +76,10 @@ class ImitationLearner:
         critics: dict[str, Critic] | None = None,
         classifier: DiscrepancyClassifier | None = None,
         seed: int = 0,
-        threads: int = 1,
     ) -> None:
-        self.policy, self.dataset, self.config, self.seed, self.threads = policy, dataset, config, seed, threads
+        self.policy, self.dataset, self.config, self.seed = policy, dataset, config, seed
         self.critics, self.classifier = critics or {}, classifier
-        self.descent = Descent(policy.net, config.learning_rate, threads)
+        self.descent = Descent(policy.net, config.learning_rate)
         self.restarts, self._episode_ended = 0, False
         self._heard: int | None = None
 
@@ -93,18 +88,15 @@ class ImitationLearner:
         loss = 0.0
         for _ in range(n):
             obs, actions = self.dataset.batches(self.config.batch)
-            loss = self.descent.step(partial(self._loss, obs, actions))
+            loss = self.descent.step(self.policy.loss(obs, actions))
         self.policy.forget()
         return loss
-
-    def _loss(self, obs: Tensor, actions: Tensor, net: Network, members: slice) -> Tensor:
-        return self.policy.loss(obs[members], actions[members], net)
 
     def restart(self) -> None:
         """New initial weights and a new optimiser; the data stay."""
         self.restarts += 1
         self.policy.restart(derive(self.seed, f"policy/restart {self.restarts}"))
-        self.descent = Descent(self.policy.net, self.config.learning_rate, self.threads)
+        self.descent = Descent(self.policy.net, self.config.learning_rate)
 
     # -- the Learner of the loop --------------------------------------------------------------------------------
 

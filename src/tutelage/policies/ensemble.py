@@ -99,13 +99,13 @@ class EnsemblePolicy(nn.Module):
         """(..., D) float32 or (..., H, W, 3) bytes -> z-scores, clipped to 10 standard deviations."""
         return normalise(obs, self.obs_mean, self.obs_std)
 
-    def loss(self, obs: Tensor, actions: Tensor, net: Network | None = None) -> Tensor:
+    def loss(self, obs: Tensor, actions: Tensor) -> Tensor:
         """Mean squared error of each member on its own batch, (K,), in units of half the action range.
 
-        obs: (K, B, D) or (K, B, H, W, 3), actions: (K, B, A); net: the members in question, by default all.
+        obs: (K, B, D) or (K, B, H, W, 3), actions: (K, B, A).
         """
         target = (actions - self.action_middle) / self.action_half
-        error: Tensor = ((net or self.net)(self.normalise(obs)) - target).square().mean(dim=(1, 2))
+        error: Tensor = (self.net(self.normalise(obs)) - target).square().mean(dim=(1, 2))
         return error
 
     def forget(self) -> None:
