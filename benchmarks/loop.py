@@ -12,7 +12,7 @@ import torch
 from benchmarks.fleets import OFFLINE, ready
 from benchmarks.original_loop import OriginalLoop
 from benchmarks.timing import Phases, ratio, table, take_turns
-from tutelage.cores import default_torch_threads
+from tutelage.cores import available_cores, default_torch_threads
 from tutelage.envs import mujoco_fleet
 from tutelage.envs.engine import wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
@@ -50,9 +50,12 @@ class Headcount:
 class Ours:
     """A loop that goes on from where it was at each call."""
 
-    def __init__(self, task: str, steps: int, overlap: bool = False, precision: Any = "float32") -> None:
+    def __init__(
+        self, task: str, steps: int, overlap: bool = False, precision: Any = "float32", threads: int | None = None
+    ) -> None:
         learner = LearnerConfig(precision=precision)
-        self.assembly, self.steps = ready(task, pretrain=PRETRAIN, overlap=overlap, learner=learner), steps
+        self.assembly = ready(task, pretrain=PRETRAIN, overlap=overlap, learner=learner, threads=threads)
+        self.steps = steps
         self.moved = Headcount()
         self.torch_threads, self.loop = torch.get_num_threads(), self.assembly.loop()
         self.loop.subscribers = [self.moved]
@@ -165,7 +168,8 @@ VARIANTS = ("original", "ours", "ours, overlap", "ours, bfloat16", "overlap, bfl
 
 def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
     """One task; every variant runs `steps` timesteps in each round."""
-    lockstep, overlap, floor = (Ours(task, steps, overlap=o) for o in (False, True, False))
+    lockstep, overlap = (Ours(task, steps, overlap=o) for o in (False, True))
+    floor = Ours(task, steps, threads=available_cores())
     low, low_overlap = (Ours(task, steps, overlap=o, precision="bfloat16") for o in (False, True))
     physics, gradients = RawPhysics(floor.assembly, floor.loop, steps), RawGradients(floor.assembly, steps)
     data, moved = lockstep.assembly.learner.dataset, Headcount()
