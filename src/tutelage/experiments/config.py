@@ -63,7 +63,7 @@ class RunConfig:
         overlap: learn everything while physics runs (the update at step t then sees the data up to t - 1).
         threads: physics threads; default: all cores, less one of three or more if something is learned at every step.
         torch_threads: threads of matrix products, at most; default: all cores, at most 4. They share each product for images
-            and for more than 400 robots; else products are too small, and only the preparation has several threads.
+            and for more than 400 robots; else products are too small, and only critics that are prepared have several.
         out: run folder; default: runs/TASK-PRIORITY-sSEED, or runs/TASK-images-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.
