@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
-import functools
-import io
-import itertools
 import os
-import re
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
@@ -31,6 +24,7 @@ from tutelage.sgc.commands import keys, proxy
 from tutelage.sgc.commands.ping import ping
 from tutelage.sgc.commands.router import router
 from tutelage.sgc.commands.top import top
+from tutelage.verbs import parse_verb
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -371,7 +365,7 @@ def main(args: Sequence[str] | None = None) -> None:
         light = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
         light |= {"serve": serve, "accounts": accounts, "audit": audit, "study": study, "robot": robot, "fleet": remote}
         verbs = light if arguments[:1] and arguments[0] in light else _learning_verbs() | light
-        _parse(verbs, arguments)()
+        parse_verb(verbs, arguments)()
         sys.stdout.flush()
     except TutelageError as error:
         print(f"tutelage: {error}", file=sys.stderr)
@@ -402,83 +396,3 @@ def _learning_verbs() -> dict[str, Any]:
         "check": check,
         "info": info,
     }
-
-
-def _parse(
-    verbs: Mapping[str, Any],
-    arguments: list[str],
-    prog: str = "tutelage",
-    description: str = "Supervised autonomy for robot fleets.",
-) -> Callable[[], None]:
-    """The call that the arguments ask for. The parser's boxes become one line, like every other error.
-
-    verbs: functions, or modules with `VERBS` of their own.
-    """
-    if not arguments or not (arguments[0] in verbs or arguments[0].startswith("-")):
-        close = difflib.get_close_matches(arguments[0], verbs, n=1) if arguments else []
-        problem = f"unknown command {arguments[0]!r}{_meant(close)}" if arguments else "no command given"
-        raise ConfigError(f"{problem}; commands: {', '.join(verbs)} (see {prog} --help)")
-    group = verbs.get(arguments[0])
-    if isinstance(group, ModuleType):
-        return _parse(group.VERBS, arguments[1:], f"{prog} {arguments[0]}", group.__doc__ or "")
-
-    def later(verb: Any) -> Callable[..., Callable[[], None]]:
-        if isinstance(verb, ModuleType):  # here for the help only
-
-            def named() -> Callable[[], None]:
-                raise AssertionError(f"{verb.__name__} is parsed above")
-
-            named.__doc__ = verb.__doc__
-            return named
-
-        @functools.wraps(verb)
-        def call(*args: Any, **kwargs: Any) -> Callable[[], None]:
-            return functools.partial(verb, *args, **kwargs)
-
-        return call
-
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
-                {name: later(verb) for name, verb in verbs.items()},
-                prog=prog,
-                args=arguments,
-                description=description,
-            )
-        return chosen
-    except SystemExit as stop:
-        if stop.code != 2:
-            raise
-    verb = f" {arguments[0]}" if arguments[0] in verbs else ""
-    raise ConfigError(f"{_problem(said.getvalue(), f'{prog}{verb} --help')} (see {prog}{verb} --help)")
-
-
-def _problem(box: str, place: str) -> str:
-    """What the parser's box says is wrong, as one line; of what it suggests, the option of this place that is closest.
-
-    Args:
-        box: its text.
-        place: the help of the verb, such as "tutelage run --help".
-    """
-    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
-    while lines and not lines[0].strip("─-"):  # some terminals have a rule below the title
-        lines.pop(0)
-    first = itertools.takewhile(lambda line: not re.fullmatch("[─-]+", line), lines)
-    told = re.sub(r" \(applied to [^)]*\)| Arguments are applied to the .* matter\.", "", " ".join(first))
-    told = " ".join(told.replace(" or misplaced", "").split()).rstrip(".")
-    given = found[0] if (found := re.search(r"(?<=: )--[\w.-]+", told)) else ""
-    option, here = "", list[str]()
-    for line in lines:
-        option = found[0] if (found := re.match(r"--[\w.-]+", line)) else option
-        if option and line == f"in {place}":
-            here.append(option)
-
-    def close(name: str) -> tuple[bool, float]:
-        return name.startswith(given), difflib.SequenceMatcher(None, name, given).ratio()
-
-    return told + _meant(sorted(here, key=close, reverse=True))
-
-
-def _meant(close: Sequence[str]) -> str:
-    return f" (did you mean {close[0]}?)" if close else ""
