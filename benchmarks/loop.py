@@ -12,7 +12,7 @@ import torch
 from benchmarks.fleets import OFFLINE, ready
 from benchmarks.original_loop import OriginalLoop
 from benchmarks.timing import Phases, ratio, table, take_turns
-from tutelage.cores import available_cores, default_torch_threads
+from tutelage.cores import default_torch_threads
 from tutelage.envs import mujoco_fleet
 from tutelage.envs.engine import wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
@@ -20,9 +20,9 @@ from tutelage.experiments.assemble import Assembly
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.modes import MOVING
 from tutelage.fleet.step import Step
-from tutelage.learning.imitation import LearnerConfig
 
 PRETRAIN = 100
+TOGETHER = "physics, gradients of the policy"
 WARM = 100
 """Timesteps before the first measurement: at the start, all robots stand upright."""
 
@@ -50,11 +50,8 @@ class Headcount:
 class Ours:
     """A loop that goes on from where it was at each call."""
 
-    def __init__(
-        self, task: str, steps: int, overlap: bool = False, precision: Any = "float32", threads: int | None = None
-    ) -> None:
-        learner = LearnerConfig(precision=precision)
-        self.assembly = ready(task, pretrain=PRETRAIN, overlap=overlap, learner=learner, threads=threads)
+    def __init__(self, task: str, steps: int, overlap: bool = False) -> None:
+        self.assembly = ready(task, pretrain=PRETRAIN, overlap=overlap)
         self.steps = steps
         self.moved = Headcount()
         self.torch_threads, self.loop = torch.get_num_threads(), self.assembly.loop()
@@ -100,12 +97,12 @@ class RawPhysics:
 
 
 class RawGradients:
-    """The same updates of policy and critic, always on the same batches: nothing is sampled, acted or recorded."""
+    """The same updates of policy and critic in the same compiled code, always on the same batches: nothing else happens."""
 
     def __init__(self, assembly: Assembly, steps: int) -> None:
         self.learner, self.steps = assembly.learner, steps
-        batches = self.learner.dataset.batches(assembly.config.learner.batch)
-        self.learner.dataset.batches = lambda size: batches  # type: ignore[method-assign]
+        rows = self.learner.dataset.draw(assembly.config.learner.batch)
+        self.learner.dataset.draw = lambda size: rows  # type: ignore[method-assign]
         for critic in self.learner.critics.values():
             for ring in (critic.plain, critic.events):
                 drawn: dict[int, Any] = {}
@@ -137,11 +134,13 @@ def watch(ours: Ours) -> Phases:
     phases.watch(fleet, "step_async", "task code")
     phases.watch(fleet, "step_wait", "task code")
     phases.watch(fleet, "reset", "reset")
-    phases.watch(fleet.physics, "restart", "physics")  # type: ignore[attr-defined]
+    phases.watch(fleet.physics, "restart", "reset")  # type: ignore[attr-defined]
     phases.watch(learner, "record", "record")
-    phases.watch(learner, "hear", "gradients, beside physics")
-    phases.watch(learner, "update", "gradients, after it")
-    phases.watch(learner.dataset, "batches", "sampling")
+    phases.watch(learner, "hear", "record")
+    phases.watch(learner.regression, "begin", "sampling")
+    phases.watch(learner.regression, "end", TOGETHER)
+    phases.watch(learner, "update", "gradients of the critic")
+    phases.watch(learner.dataset, "draw", "sampling")
     for critic in learner.critics.values():
         for ring in (critic.plain, critic.events):
             phases.watch(ring, "draw", "sampling")
@@ -163,14 +162,13 @@ def run(quick: bool = False) -> dict[str, Any]:
     return {"loop": results}
 
 
-VARIANTS = ("original", "ours", "ours, overlap", "ours, bfloat16", "overlap, bfloat16", "raw physics", "raw gradients")
+VARIANTS = ("original", "ours", "ours, overlap", "raw physics", "raw gradients")
 
 
 def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
     """One task; every variant runs `steps` timesteps in each round."""
     lockstep, overlap = (Ours(task, steps, overlap=o) for o in (False, True))
-    floor = Ours(task, steps, threads=available_cores())
-    low, low_overlap = (Ours(task, steps, overlap=o, precision="bfloat16") for o in (False, True))
+    floor = Ours(task, steps)
     physics, gradients = RawPhysics(floor.assembly, floor.loop, steps), RawGradients(floor.assembly, steps)
     data, moved = lockstep.assembly.learner.dataset, Headcount()
     original = OriginalLoop(
@@ -182,17 +180,16 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         counter.counts.clear()
 
     phases = watch(lockstep)
-    phases.watch(mujoco_fleet, "wait", "physics")
+    timed = phases.timed(wait, TOGETHER)
+    mujoco_fleet.wait = lambda futures: (timed if phases.open else wait)(futures)  # all fleets call it, not only this one
     try:
         seconds = take_turns(
             {
                 "original": lambda: original.run(steps), "ours": lockstep, "ours, overlap": overlap,
-                "ours, bfloat16": low, "overlap, bfloat16": low_overlap,
                 "raw physics": physics, "raw gradients": gradients,
             }, rounds, before={
                 "original": share, "ours": lockstep.threads, "ours, overlap": overlap.threads,
-                "ours, bfloat16": low.threads, "overlap, bfloat16": low_overlap.threads,
-                "raw physics": physics.rewind, "raw gradients": share,
+                "raw physics": physics.rewind,
             },
         )  # fmt: skip
     finally:
@@ -204,8 +201,6 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         "ratios": {
             "original / ours": ratio(seconds, "original", "ours"),
             "original / overlap": ratio(seconds, "original", "ours, overlap"),
-            "original / bfloat16": ratio(seconds, "original", "ours, bfloat16"),
-            "original / overlap, bfloat16": ratio(seconds, "original", "overlap, bfloat16"),
             "ours / floor": ratio(seconds, "ours", *floors),
             "overlap / floor": ratio(seconds, "ours, overlap", *floors),
         },
@@ -214,6 +209,6 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         "threads": {
             "physics": lockstep.loop.fleet.physics.threads,  # type: ignore[attr-defined]
             "torch": lockstep.torch_threads,
-            "torch, original and raw gradients": default_torch_threads(),
+            "torch, original": default_torch_threads(),
         },
     }

@@ -48,6 +48,11 @@ class Phases:
         self.seconds: dict[str, float] = {}
         self._inside = [0.0]
 
+    @property
+    def open(self) -> bool:
+        """Whether a phase is being timed."""
+        return len(self._inside) > 1
+
     def watch(self, owner: Any, method: str, phase: str) -> None:
         """Time a method of an object, or a function of a module, from now on."""
         setattr(owner, method, self.timed(getattr(owner, method), phase))

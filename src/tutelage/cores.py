@@ -1,10 +1,12 @@
-"""How many cores there are for physics and for matrix products, and how memory between them is reused."""
+"""The cores of this machine and the threads that physics and learning share, and how memory between them is reused."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 
 def available_cores() -> int:
@@ -17,10 +19,27 @@ def default_torch_threads() -> int:
     return min(4, available_cores())
 
 
-def cores_beside_learning() -> int:
-    """Threads of physics while one thread learns: of three cores and more, that one is left alone."""
-    cores = available_cores()
-    return cores - 1 if cores > 2 else cores
+@cache
+def workers(threads: int | None = None) -> ThreadPoolExecutor:
+    """So many threads of this process, by default one a core, for compiled code that holds no interpreter lock.
+
+    Whoever asks for the same number gets the same threads: physics and learning take turns in them, so that together they
+    have no more than there are cores. What runs in one of them must not wait for another.
+    """
+    return ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="worker")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=workers.cache_clear)  # a forked process has none of these threads
+
+
+@cache
+def one_thread_a_product() -> None:
+    """Let compiled code compute each of its matrix products in the thread that asks for it (in this process, for good)."""
+    import scipy.linalg.cython_blas  # noqa: F401  the library that compiled code calls must be there to be told
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1, user_api="blas")
 
 
 def keep_freed_memory() -> None:

@@ -219,7 +219,6 @@ def test_a_fleet_goes_on_bit_for_bit_from_a_checkpoint_across_goals() -> None:
 def test_each_gait_turns_the_cube_its_way(side: str) -> None:
     trial = Trial(1, 8, 100, side)
     turned, lost = trial.run(shipped()[side].numbers[None, None], np.random.default_rng(0), 0.0)
-    trial.physics.close()
     assert np.median(turned) > 1.8
     assert (lost < 1).mean() >= 0.75
 
@@ -274,7 +273,6 @@ def test_candidates_are_tried_from_the_same_starts() -> None:
     gait = shipped()["left"].numbers
     trial = Trial(2, 3, 20, "left")
     turned, lost = trial.run(np.stack([gait, gait])[:, None], np.random.default_rng(0), 0.2)
-    trial.physics.close()
     np.testing.assert_array_equal(turned[0], turned[1])
     np.testing.assert_array_equal(lost[0], lost[1])
 
@@ -297,5 +295,4 @@ def test_a_search_writes_a_gait_beside_the_other_one_and_begins_from_it_again(tm
 def test_both_gaits_take_turns_from_goal_to_goal() -> None:
     trial = Trial(1, 6, 120, None)
     turned, _ = trial.run(np.stack([shipped()[side].numbers for side in SIDES])[None], np.random.default_rng(0), 0.0)
-    trial.physics.close()
     assert np.median(turned) > 2.5

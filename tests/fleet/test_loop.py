@@ -100,29 +100,40 @@ def test_with_overlap_learning_happens_while_physics_runs() -> None:
     assert log[-5:] == ["step_async", "update", "step_wait", "reset", "record"]
 
 
-def test_a_prompt_learner_hears_what_humans_want_while_physics_runs_and_the_rest_after_it() -> None:
+@pytest.mark.parametrize(
+    ("overlap", "order"),
+    [(False, ["hear", "begin", "step_async", "step_wait", "record", "update"]),
+     (True, ["begin", "step_async", "update", "step_wait", "record"])],
+)  # fmt: skip
+def test_a_prompt_learner_begins_before_physics_with_what_humans_want_or_with_what_was_before(overlap, order) -> None:
     class Prompt(FakeLearner):
-        def hear(self, t, obs, wanted) -> dict[str, float]:
+        def hear(self, t, obs, wanted) -> None:
             self.log.append("hear")
             heard.append((t, obs.copy(), wanted.copy()))
-            return {"heard": float(t)}
+
+        def begin(self, t) -> None:
+            self.log.append("begin")
+            begun.append(t)
 
     log: list[Any] = []
     heard: list[Any] = []
-    loop = make_loop(PointFleet(3, log=log), wants([0.0, 1.0, 0.0]), 1, learner=Prompt(log))
+    begun: list[int] = []
+    loop = make_loop(PointFleet(3, log=log), wants([0.0, 1.0, 0.0]), 1, learner=Prompt(log), overlap=overlap)
     assert isinstance(loop.learner, PromptLearner)
     loop.step()
     log.clear()
     step = loop.step()
-    assert [what for what in log if what in ("step_async", "hear", "step_wait", "record", "update")] == [
-        "step_async", "hear", "step_wait", "record", "update",
-    ]  # fmt: skip
+    assert [what for what in log if what in ("step_async", "hear", "begin", "step_wait", "record", "update")] == order
+    assert begun == [0, 1]
+    assert step.taught.tolist() == [False, True, False]
+    assert step.losses == {"policy": 1.0}
+    if overlap:
+        assert not heard
+        return
     t, obs, wanted = heard[-1]
     assert t == step.t == 1
-    assert step.taught.tolist() == [False, True, False]
     np.testing.assert_array_equal(obs, step.obs[step.taught])
     np.testing.assert_array_equal(wanted, step.wanted[step.taught])
-    assert step.losses == {"heard": 1.0, "policy": 1.0}
 
 
 def test_with_overlap_nothing_is_heard_early() -> None:

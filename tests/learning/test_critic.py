@@ -13,6 +13,8 @@ from numpy.random import default_rng
 
 from tutelage.errors import ConfigError
 from tutelage.learning.critic import Critic, CriticConfig, Ring
+from tutelage.learning.twins import BatchedTwins, CompiledTwins
+from tutelage.policies.mlp import BatchedMLP
 from tutelage.store import load_tree, save_tree
 
 # -- the ring -------------------------------------------------------------------------------------------------------
@@ -188,12 +190,31 @@ def test_a_timeout_is_not_an_end_but_an_end_is() -> None:
 
 
 class SpyCritic(Critic):
-    """Keeps the batches and targets of its updates."""
+    """Keeps what its networks are asked and taught."""
 
-    def _q(self, net, obs, actions):
-        q = super()._q(net, obs, actions)
-        self.asked = [*getattr(self, "asked", []), (net is self.target, obs.clone(), actions.clone(), q.detach().clone())]
-        return q
+    def __init__(self, *arguments) -> None:
+        super().__init__(*arguments)
+        self.asked, self.taught, inner = [], [], self.twins
+        ask, step = inner.ask, inner.step
+
+        def spied_ask(obs, actions, of_target=False):
+            self.asked.append((of_target, obs.copy(), np.array(actions)))
+            return ask(obs, actions, of_target)
+
+        def spied_step(obs, actions, y):
+            self.taught.append((obs.copy(), actions.copy(), y.copy(), by_hand(self, self.net, obs, actions)))
+            return step(obs, actions, y)
+
+        inner.ask, inner.step = spied_ask, spied_step
+
+
+def by_hand(critic: Critic, net, obs, actions) -> np.ndarray:
+    """What both twins say, (2, B), by PyTorch alone; for the scale that every critic here has."""
+    x = torch.from_numpy(np.asarray(obs, dtype=np.float32))
+    if x.dim() == 4:
+        x = (x - 127) / 74
+    with torch.no_grad():
+        return net(x, torch.from_numpy(np.asarray(actions, dtype=np.float32)))[:, :, 0].numpy()
 
 
 @pytest.mark.parametrize(("batch", "positives", "expected"), [(256, 0.25, 64), (64, 0.1, 6), (2, 0.25, 1), (8, 0.9, 7)])
@@ -203,29 +224,35 @@ def test_a_batch_has_its_share_of_events_however_rare_they_are(batch, positives,
     eye = np.eye(LENGTH)
     critic.add(eye[np.zeros(999, int)], np.ones((999, 1)), eye[np.zeros(999, int)], never(999), end=never(999))
     critic.update()
-    assert (critic.asked[-1][1][:, 4] == 0).all()  # no events yet: a batch without
+    assert (critic.taught[-1][0][:, 4] == 0).all()  # no events yet: a batch without
     critic.add(eye[[4]], np.ones((1, 1)), eye[[4]], np.array([True]), end=np.array([True]))
     critic.update()
-    obs = critic.asked[-1][1]
+    obs = critic.taught[-1][0]
     assert len(obs) == batch
     assert int(obs[:, 4].sum()) == expected
 
 
-@pytest.mark.parametrize(("event", "worst"), [("bad", torch.amax), ("good", torch.amin)])
+@pytest.mark.parametrize(("event", "worst"), [("bad", np.max), ("good", np.min)])
 def test_queries_and_targets_take_the_same_twin(event, worst) -> None:
     config = CriticConfig(batch=16, hidden=(8,), gamma=0.9, learning_rate=1e-9)
     critic = SpyCritic(LENGTH, 1, event, Rightwards(), config, NO_SCALE, default_rng(0), 3)
     obs, action, after, _ = chain_transitions()
     critic.add(obs, action, after, never(10), end=never(10))
 
-    np.testing.assert_array_equal(critic(obs, action), worst(critic.asked[-1][3], 0).numpy())
-    assert (critic.asked[-1][3][0] != critic.asked[-1][3][1]).all()
+    said = by_hand(critic, critic.net, obs, action)
+    assert (said[0] != said[1]).all()
+    np.testing.assert_allclose(critic(obs, action), worst(said, axis=0), rtol=1e-5)
+    assert not critic.asked[-1][0]
+    target = [parameter.detach().clone() for parameter in critic.target.parameters()]
     loss = critic.update()
-    (of_target, _, then, future), (of_net, _, _, now) = critic.asked[-2:]
-    assert (of_target, of_net) == (True, False)
+    of_target, after, then = critic.asked[-1]
+    assert of_target
     assert (then == 1).all()
-    by_hand = (now - 0.9 * worst(future, 0)).square().mean()
-    assert loss == pytest.approx(float(by_hand), rel=1e-5)
+    _, _, y, now = critic.taught[-1]
+    for parameter, before in zip(critic.target.parameters(), target, strict=True):
+        parameter.data.copy_(before)
+    np.testing.assert_allclose(y, 0.9 * worst(by_hand(critic, critic.target, after, then), axis=0), rtol=1e-5)
+    assert loss == pytest.approx(float(np.square(now - y).mean()), rel=1e-5)
 
 
 def test_the_target_network_follows_slowly() -> None:
@@ -236,6 +263,28 @@ def test_the_target_network_follows_slowly() -> None:
     critic.update()
     for old, new, net in zip(before, critic.target.parameters(), critic.net.parameters(), strict=True):
         torch.testing.assert_close(new, old + 0.25 * (net - old))
+
+
+@pytest.mark.parametrize("largest", [True, False])
+@pytest.mark.parametrize("batch", [1, 40])
+def test_compiled_twins_learn_and_answer_as_those_of_pytorch(largest, batch) -> None:
+    rng, both = default_rng(0), []
+    scale = torch.full((5,), 5.0), torch.full((5,), 2.0), torch.tensor([1.0, 0.0]), torch.tensor([3.0, 1.0])
+    for kind in (CompiledTwins, BatchedTwins):
+        nets = [BatchedMLP(2, 7, 1, (16, 8), torch.Generator().manual_seed(s), torch.sigmoid) for s in (0, 1)]
+        threads = (2,) if kind is CompiledTwins else ()
+        both.append((kind(*nets, scale, largest, 1e-2, 0.1, *threads), nets))
+    (compiled, nets), (reference, expected) = both
+    for _ in range(20):
+        obs, actions, y = rng.normal(5, 3, (batch, 5)), rng.normal(size=(batch, 2)), rng.random(batch)
+        assert compiled.step(obs, actions, y) == pytest.approx(reference.step(obs, actions, y), rel=1e-4)
+        for of_target in (False, True):
+            said = compiled.ask(obs, actions, of_target)
+            assert said.shape == (batch,)
+            np.testing.assert_allclose(said, reference.ask(obs, actions, of_target), rtol=1e-3)
+    for net, other in zip(nets, expected, strict=True):
+        for mine, theirs in zip(net.parameters(), other.parameters(), strict=True):
+            torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=2e-5)
 
 
 def test_estimates_are_probabilities_of_shape_n() -> None:
@@ -304,9 +353,11 @@ def test_a_critic_of_images_has_the_targets_of_any_other() -> None:
     critic, seen = seeing(), pictures(0, 6, (64, 64))
     critic.add(**{**seen, "event": never(6), "end": never(6)})
     loss = critic.update()
-    (_, after, then, future), (_, _, _, now) = critic.asked[-2:]
-    np.testing.assert_array_equal(then, Pointing().act(after.numpy()))
-    assert loss == pytest.approx(float((now - 0.9 * future.amin(0)).square().mean()), rel=1e-5)
+    (_, after, then), (_, _, y, now) = critic.asked[-1], critic.taught[-1]
+    np.testing.assert_array_equal(then, Pointing().act(after))
+    future = by_hand(critic, critic.target, after, then)  # it goes 0.005 of a way of 1e-9 in a step
+    np.testing.assert_allclose(y, 0.9 * future.min(axis=0), rtol=1e-4)
+    assert loss == pytest.approx(float(np.square(now - y).mean()), rel=1e-5)
     q = critic(seen["obs"], seen["action"])
     assert q.shape == (6,)
     assert ((q > 0) & (q < 1)).all()

@@ -7,7 +7,10 @@ import pytest
 import torch
 from numpy.random import default_rng
 
+from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.descent import Descent
+from tutelage.learning.regression import BatchedRegression, CompiledRegression, regression
+from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.policies.networks import network
 from tutelage.policies.weights import module_state
 
@@ -61,3 +64,89 @@ def test_a_saved_state_goes_on_as_if_nothing_had_been() -> None:
     other.load_state_dict(moments)
     assert [go_on() for _ in range(3)] == expected
     assert expected[-1] < float(made()[2]().mean())
+
+
+# -- compiled -------------------------------------------------------------------------------------------------------
+
+
+def ensemble(hidden: tuple[int, ...], actions: int = 2, seed: int = 0, threads: int = 2) -> EnsemblePolicy:
+    low, high = np.full(actions, -2.0), np.full(actions, 1.0)
+    policy = EnsemblePolicy(5, low, high, members=MEMBERS, hidden=hidden, seed=seed, threads=threads)
+    policy.set_normalisation(default_rng(9).normal(1.0, 2.0, (50, 5)))
+    return policy
+
+
+def pairs(n: int = 40, actions: int = 2) -> AggregatedDataset:
+    rng = default_rng(1)
+    data = AggregatedDataset((5,), actions, MEMBERS, default_rng(2))
+    data.add(rng.normal(1.0, 4.0, (n, 5)), rng.uniform(-2, 1, (n, actions)))
+    return data
+
+
+@pytest.mark.parametrize("hidden", [(), (7,), (16, 8, 4)])
+@pytest.mark.parametrize("batch", [1, 6])
+def test_compiled_steps_are_those_of_automatic_differentiation(hidden, batch) -> None:
+    compiled, reference = ensemble(hidden), ensemble(hidden)
+    one, other = regression(compiled, 1e-2), Descent(reference.net, 1e-2)
+    assert isinstance(one, CompiledRegression)
+    data, same = pairs(), pairs()
+    for _ in range(30):
+        one.begin(data, batch)
+        loss = other.step(reference.loss(*same.batches(batch)))
+        assert one.end() == pytest.approx(loss, rel=1e-4)
+        for mine, theirs in zip(compiled.net.parameters(), reference.net.parameters(), strict=True):
+            torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=2e-5)
+
+
+def test_compiled_moments_are_those_of_pytorchs_adam_and_go_both_ways() -> None:
+    compiled, reference = ensemble((7,)), ensemble((7,))
+    one, other = regression(compiled, 1e-2), BatchedRegression(reference, 1e-2)
+    assert one.state_dict() == {}
+    data, same = pairs(), pairs()
+    for _ in range(3):
+        one.begin(data, 6)
+        one.end()
+        other.begin(same, 6)
+        other.end()
+    mine, theirs = one.state_dict(), other.state_dict()
+    assert mine.keys() == theirs.keys()
+    for position, moments in mine.items():
+        for name, array in moments.items():
+            assert array.shape == theirs[position][name].shape
+            np.testing.assert_allclose(array, theirs[position][name], rtol=1e-3, atol=1e-7)
+    again = ensemble((7,))
+    again.load_state_dict(compiled.state_dict())
+    go_on = regression(again, 1e-2)
+    go_on.load_state_dict(mine)
+    more = data.state_dict()
+    for each in (one, go_on):
+        data.load_state_dict(more)
+        each.begin(data, 6)
+        each.end()
+    assert all(torch.equal(a, b) for a, b in zip(compiled.net.parameters(), again.net.parameters(), strict=True))
+    go_on.load_state_dict({})
+    assert go_on.state_dict() == {}
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    said = []
+    for threads in (1, 2, 3):
+        policy, data = ensemble((64, 64), threads=threads), pairs()
+        learner = regression(policy, 1e-2)
+        for _ in range(5):
+            learner.begin(data, 32)
+            learner.end()
+        obs = default_rng(3).normal(size=(300, 5))
+        said.append((policy.act(obs), policy.uncertainty(obs)))
+    for action, uncertainty in said[1:]:
+        np.testing.assert_array_equal(action, said[0][0])
+        np.testing.assert_array_equal(uncertainty, said[0][1])
+
+
+def test_what_goes_wrong_in_the_background_is_raised_at_the_end() -> None:
+    policy, data = ensemble((7,)), pairs()
+    learner = BatchedRegression(policy, 1e-2)
+    policy.loss = lambda *_: torch.zeros(1) / "nothing"  # type: ignore[operator]
+    learner.begin(data, 4)
+    with pytest.raises(TypeError):
+        learner.end()

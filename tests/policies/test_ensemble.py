@@ -93,7 +93,8 @@ def test_inputs_are_z_scored_and_clipped_and_constant_ones_are_harmless() -> Non
 
 def test_action_and_uncertainty_of_the_same_observations_cost_one_pass() -> None:
     policy, calls = make(), []
-    policy.net.register_forward_hook(lambda *_: calls.append(1))
+    ask = policy._ask_compiled
+    policy._ask_compiled = lambda *arguments: calls.append(1) or ask(*arguments)
     obs = default_rng(0).normal(size=(4, 6))
     policy.act(obs)
     policy.uncertainty(obs)
@@ -166,3 +167,23 @@ def test_a_state_in_memory_is_a_copy() -> None:
     assert not np.array_equal(state["net.weights.0"], policy.net.weights[0].detach().numpy())
     load_module_state(policy, state)
     np.testing.assert_array_equal(state["net.weights.0"], policy.net.weights[0].detach().numpy())
+
+
+@pytest.mark.parametrize("robots", [1, 100, 300])
+@pytest.mark.parametrize("hidden", [(), (16, 8)])
+def test_compiled_answers_are_those_of_pytorch(robots, hidden) -> None:
+    """Also for more robots than one thread is asked about at a time."""
+    policy = EnsemblePolicy(6, np.array([-1.0, 0.0]), np.array([1.0, 5.0]), members=4, hidden=hidden, seed=1, threads=2)
+    policy.set_normalisation(default_rng(1).normal(2.0, 3.0, (50, 6)))
+    obs = default_rng(0).normal(2.0, 30.0, (robots, 6))  # some are clipped
+    action, spread = policy._ask_torch(obs)
+    np.testing.assert_allclose(policy.act(obs), action, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(policy.uncertainty(obs), spread, rtol=1e-4, atol=1e-6)
+    assert policy.act(obs).dtype == np.float32
+
+
+def test_weights_that_are_not_numbers_give_actions_that_are_not() -> None:
+    """The loop refuses such actions; a rectifier must not hide them."""
+    policy = make()
+    policy.net.weights[0].data[:] = np.nan
+    assert np.isnan(policy.act(np.ones((2, 6)))).all()

@@ -8,24 +8,24 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding
+import numba
 import numpy as np
+from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from tutelage.cores import available_cores
+from tutelage.cores import available_cores, workers
 from tutelage.errors import MissingExtraError
 
 try:
-    import llvmlite.binding
     import mujoco
-    import numba
-    from numba import types
-    from numba.extending import intrinsic
 except ImportError as error:  # pragma: no cover - exercised in an environment without the extra
-    raise MissingExtraError(error.name or "mujoco", "mujoco") from error
+    raise MissingExtraError("mujoco", "mujoco") from error
 
 Array = NDArray[Any]
 
@@ -157,7 +157,7 @@ class Physics:
         fields: names of float64 `mjData` arrays to bring back after each step, such as ("qpos", "qvel", "cfrc_ext").
         push_body: name or index of the body on which `advance(push=...)` acts.
         contact_forces: also compute `cfrc_ext` after each step (`mj_rnePostConstraint`).
-        threads: worker threads; default: one per core this process may use.
+        threads: worker threads; default: one per core this process may use. See `workers`.
 
     `frame[name]` is the field of all robots, shape (N, *field shape), a view that the next step overwrites.
 
@@ -186,7 +186,7 @@ class Physics:
         self.unstable = np.zeros(num_robots, dtype=np.int8)
         self._forces = contact_forces
         self._push_body = self.model.body(push_body).id
-        self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
+        self._pool = workers(threads or available_cores())
 
         shapes = {name: getattr(self.datas[0], name).shape for name in fields}
         self._sizes = np.array([int(np.prod(s)) for s in shapes.values()], dtype=np.intp)
@@ -295,10 +295,6 @@ class Physics:
     def raw_frame(self) -> Array:
         """All fields of all robots, (N, width) float64, in one array."""
         return self._frame
-
-    def close(self) -> None:
-        """Stop the worker threads."""
-        self._pool.shutdown()
 
 
 def wait(futures: list[Future[None]]) -> None:

@@ -132,8 +132,7 @@ class MujocoFleet(TaskFleet):
         return self._renderers[key].picture(self.physics.datas[robot])  # type: ignore[no-any-return]
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Stop the physics threads and free the renderers."""
-        self.physics.close()
+        """Free the renderers."""
         for renderer in self._renderers.values():
             renderer.close()
 

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-
-from tutelage.errors import MissingExtraError
-
-try:
-    import numba
-except ImportError as error:
-    raise MissingExtraError("numba", "mujoco") from error
 
 Array = NDArray[Any]
 Picture = NDArray[np.uint8]

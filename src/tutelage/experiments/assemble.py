@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tutelage.cores import cores_beside_learning, default_torch_threads, keep_freed_memory
+from tutelage.cores import default_torch_threads, keep_freed_memory
 from tutelage.envs import experts
 from tutelage.envs.registry import find_task, make_fleet
 from tutelage.envs.task_fleet import TaskFleet
@@ -40,10 +40,6 @@ from tutelage.policies.networks import hidden_layers, stored_as
 from tutelage.seeding import derive, stream
 
 Array = NDArray[Any]
-
-
-MANY = 400
-"""Robots from which on products of matrices are large enough for several threads, and physics is most of a step."""
 
 
 @dataclass
@@ -143,7 +139,8 @@ def assemble(config: RunConfig) -> Assembly:
 
     shape, actions = _obs_shape(fleet, config), len(fleet.action_low)
     config = sized(config, shape)
-    torch.set_num_threads(config.torch_threads or 1 if _share_products(config, shape) else 1)
+    # Of vectors, PyTorch computes only what is too small to be worth a meeting of threads.
+    torch.set_num_threads(config.torch_threads or default_torch_threads() if len(shape) == 3 else 1)
     keep_freed_memory()
     known = shape[0] if fleet.state is None else fleet.state.shape[1]
     if isinstance(actor, GaussianActor) and (actor.features > known or len(actor.low) != actions):
@@ -183,6 +180,7 @@ def learner_of(config: RunConfig, shape: tuple[int, ...], low: Array, high: Arra
     policy = EnsemblePolicy(
         shape, low, high,
         members=config.members, hidden=config.hidden, seed=derive(config.seed, "policy/initial weights"),
+        threads=config.threads,
     )  # fmt: skip
     dataset = AggregatedDataset(
         shape, actions, config.members, stream(config.seed, "dataset"), config.bootstrap, stored_as(shape)
@@ -190,7 +188,8 @@ def learner_of(config: RunConfig, shape: tuple[int, ...], low: Array, high: Arra
     scale = (policy.obs_mean, policy.obs_std, policy.action_middle, policy.action_half)
     critics = {
         name: Critic(shape, actions, "bad" if name == "risk" else "good", policy, config.critic, scale,
-                     stream(config.seed, f"critic/{name}"), derive(config.seed, f"critic/{name}/initial weights"))
+                     stream(config.seed, f"critic/{name}"), derive(config.seed, f"critic/{name}/initial weights"),
+                     config.threads)
         for name in sorted(priority.needs & {"risk", "goal"})
     }  # fmt: skip
     classifier = None
@@ -200,11 +199,6 @@ def learner_of(config: RunConfig, shape: tuple[int, ...], low: Array, high: Arra
             beta_h=np.nan if config.gate.beta_h is None else config.gate.beta_h, batch=config.learner.batch,
         )  # fmt: skip
     return ImitationLearner(policy, dataset, config.learner, critics, classifier, config.seed)
-
-
-def _share_products(config: RunConfig, shape: tuple[int, ...]) -> bool:
-    """Whether threads share each matrix product. It pays for images and for many robots; for others, meeting costs more."""
-    return len(shape) == 3 or config.robots > MANY
 
 
 def fleet_of(config: RunConfig, num_envs: int, level: str | None, **settings: Any) -> Fleet:
@@ -246,9 +240,6 @@ def _resolve_defaults(config: RunConfig) -> RunConfig:
         changes["thresholds"] = dataclasses.replace(t, initial=initial)
     if config.torch_threads is None:
         changes["torch_threads"] = default_torch_threads()
-    always = config.learner.schedule == "step" and config.learner.every == 1
-    if config.threads is None and task and always and config.robots <= MANY:
-        changes["threads"] = cores_beside_learning()
     if set(config.priority.split(".")) <= {"C", ""}:
         # No human data can arrive: the Constraint baseline keeps the cloned policy (section 5.4).
         changes["learner"] = dataclasses.replace(config.learner, schedule="never")

@@ -21,7 +21,7 @@ from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
 from tutelage.learning.ppo import PPOConfig
 
-FORMAT = 2
+FORMAT = 3
 """Version of a run folder. A folder of another version is refused, never guessed at."""
 
 
@@ -61,9 +61,8 @@ class RunConfig:
         expert: the algorithmic humans: a file of weights, or module:function that returns a policy; default: the weights
             shipped with the task.
         overlap: learn everything while physics runs (the update at step t then sees the data up to t - 1).
-        threads: physics threads; default: all cores, less one of three or more if something is learned at every step.
-        torch_threads: threads of matrix products, at most; default: all cores, at most 4. They share each product for images
-            and for more than 400 robots; else products are too small, and only critics that are prepared have several.
+        threads: threads of physics, in which the policy learns as well; default: all cores.
+        torch_threads: threads of all other matrix products; default: all cores, at most 4.
         out: run folder; default: runs/TASK-PRIORITY-sSEED, or runs/TASK-images-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tutelage.envs.tasks.base import Task
@@ -58,8 +56,7 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
         if goal := learner.critics.get("goal"):  # eq. 3.6 is over D_r and D_h; a risk critic would learn nothing from calm
             goal.add(obs, actions, shown.next_obs, shown.success, end=shown.success)
         for name, critic in learner.critics.items():
-            with _sharing(c.torch_threads or 1):
-                _in_steps(c.critic.pretrain, critic.updates, f"{name} critic", report)
+            _in_steps(c.critic.pretrain, critic.updates, f"{name} critic", report)
             signals[name] = np.concatenate([critic(o, a) for o, a in signals["visited"]])
         if c.thresholds.missed is not None and c.thresholds.risk is None and "risk" in learner.critics:
             falls = _risk_before_falls(assembly, report)
@@ -67,17 +64,6 @@ def prepare(assembly: Assembly, report: Report = lambda what, done: None) -> Ass
             c = dataclasses.replace(c, thresholds=dataclasses.replace(c.thresholds, risk=bound))
         c = _resolve_gate(_resolve_thresholds(c, signals), signals, offline)
     return dataclasses.replace(assembly, config=c)
-
-
-@contextmanager
-def _sharing(threads: int) -> Iterator[None]:
-    """Let so many threads share each matrix product: here nothing else wants the cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class Demonstrations(NamedTuple):

@@ -75,6 +75,7 @@ class Loop:
         self.fleet, self.policy, self.priority, self.team = fleet, policy, priority, team
         self.allocator, self.execution = allocator or FleetDAgger(), execution or AsWanted()
         self.learner, self.overlap, self.wait, self.subscribers = learner, overlap, wait, list(subscribers)
+        self._prompt = learner if isinstance(learner, PromptLearner) else None
         self.signals: dict[str, Signal] = {"uncertainty": lambda view: policy.uncertainty(view.obs)}  # type: ignore[attr-defined]
         if not hasattr(policy, "uncertainty"):
             del self.signals["uncertainty"]
@@ -120,12 +121,14 @@ class Loop:
         held = silent | waiting
         losses: dict[str, float] = {}
 
+        if self._prompt:
+            if not self.overlap:
+                taught = (mode == Mode.TELEOPERATED) & ~held
+                self._prompt.hear(self.t, view.obs[taught], wanted[taught])
+            self._prompt.begin(self.t)
         self.fleet.step_async(actions, active=MOVING[mode] & ~held)
         if self.learner and self.overlap:
             losses = self.learner.update(self.t)
-        elif isinstance(self.learner, PromptLearner):
-            taught = (mode == Mode.TELEOPERATED) & ~held
-            losses = self.learner.hear(self.t, view.obs[taught], wanted[taught])
         next_obs, reward, _, truncated, info = self.fleet.step_wait()
 
         success = info["success"] & ~info["violation"]  # a robot that fell has not completed anything

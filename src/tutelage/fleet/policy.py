@@ -53,12 +53,15 @@ class Learner(Protocol):
 
 @runtime_checkable
 class PromptLearner(Learner, Protocol):
-    """A learner that need not wait for the outcome of a timestep to learn from what humans said in it."""
+    """A learner that need not wait for the outcome of a timestep to learn from what humans said in it.
 
-    def hear(self, t: int, obs: Array, wanted: Array) -> dict[str, float]:
-        """Take in what humans want of n robots in timestep t, obs (n, ...) and wanted (n, A), and learn from it.
+    `record` and `update` follow and do the rest, so that the result is the same as if they had done all.
+    """
 
-        Called while physics runs. `record` and `update` follow and do the rest, so that the result is the same as if they
-        had done all. Returns losses by name.
-        """
+    def hear(self, t: int, obs: Array, wanted: Array) -> None:
+        """Take in what humans want of n robots in timestep t, obs (n, ...) and wanted (n, A), before the robots move."""
+        ...
+
+    def begin(self, t: int) -> None:
+        """Start to learn in the background, beside physics, from all data so far."""
         ...

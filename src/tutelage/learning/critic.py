@@ -18,10 +18,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tutelage.cores import available_cores
 from tutelage.errors import ConfigError
 from tutelage.fleet.policy import Policy
-from tutelage.learning.descent import Descent
-from tutelage.policies.networks import Network, Shape, as_tensor, hidden_layers, network, normalise, shape_of, stored_as
+from tutelage.learning.twins import Scale, twins
+from tutelage.policies.networks import Shape, hidden_layers, network, shape_of, stored_as
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import rng_state, set_rng_state
 
@@ -136,6 +137,7 @@ class Critic:
         config: hyper-parameters.
         scale: (obs_mean, obs_std, action_middle, action_half), to normalise inputs.
         rng: the seeded stream of batches; seed: of the initial weights.
+        threads: see `workers`; default: one a core. Networks that see vectors are asked, and learn, in them.
     """
 
     def __init__(
@@ -145,26 +147,26 @@ class Critic:
         event: Literal["bad", "good"],
         policy: Policy,
         config: CriticConfig,
-        scale: tuple[Tensor, Tensor, Tensor, Tensor],
+        scale: Scale,
         rng: np.random.Generator,
         seed: int,
+        threads: int | None = None,
     ) -> None:
-        self.config, self.policy, self.rng, self.scale = config, policy, rng, scale
-        self.event = event
+        self.config, self.policy, self.rng = config, policy, rng
         hidden = hidden_layers(obs, config.hidden)
         self.net, self.target = (
             network(obs, 2, 1, hidden, torch.Generator().manual_seed(seed), torch.sigmoid, extra=action_width)
             for _ in range(2)
         )
-        self.descent = Descent(self.net, config.learning_rate)
+        self.twins = twins(
+            self.net, self.target, scale, event == "bad", config.learning_rate, config.tau, threads or available_cores()
+        )
         self.plain = Ring(config.capacity, obs, action_width)
         self.events = Ring(max(1, config.capacity // 10), obs, action_width)
 
     def __call__(self, obs: Array, actions: Array) -> Array:
         """Q(s, a) of each robot: (N, D) or (N, H, W, 3), (N, A) -> (N,) in [0, 1]."""
-        with torch.no_grad():
-            q = self._q(self.net, as_tensor(obs), as_tensor(actions))
-        return self._worst(q).numpy()
+        return self.twins.ask(obs, actions)
 
     def add(self, obs: Array, action: Array, next_obs: Array, event: Array, end: Array) -> None:
         """Take in n transitions. event: (n,) bool, it happened in this step; end: (n,) bool, nothing can follow."""
@@ -181,38 +183,24 @@ class Critic:
         rows = self.plain.draw(self.config.batch - positives, self.rng)
         if positives:
             rows = torch.cat([rows, self.events.draw(positives, self.rng)])
-        batch = self.plain.columns(rows)
-        y = torch.ones(len(rows))  # of events, which come last
-        with torch.no_grad():
-            after, end = (batch[name][: len(rows) - positives] for name in ("next_obs", "end"))
-            then = torch.from_numpy(np.asarray(self.policy.act(after.numpy()), np.float32))
-            future = self._worst(self._q(self.target, after, then))
-            y[: len(after)] = self.config.gamma * (1 - end) * future
-        loss = self.descent.step((self._q(self.net, batch["obs"], batch["action"]) - y).square().mean(dim=1))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.target.parameters()), list(self.net.parameters()), self.config.tau)
-        return loss
-
-    def _worst(self, q: Tensor) -> Tensor:
-        """The more pessimistic twin: (2, B) -> (B,)."""
-        return q.amax(0) if self.event == "bad" else q.amin(0)
+        batch = {name: part.numpy() for name, part in self.plain.columns(rows).items()}
+        y = np.ones(len(rows), np.float32)  # of events, which come last
+        after, end = (batch[name][: len(rows) - positives] for name in ("next_obs", "end"))
+        future = self.twins.ask(after, self.policy.act(after), of_target=True)
+        y[: len(after)] = self.config.gamma * (1 - end) * future
+        return self.twins.step(batch["obs"], batch["action"], y)
 
     def updates(self, n: int) -> None:
         """n gradient steps."""
         for _ in range(n):
             self.update()
 
-    def _q(self, net: Network, obs: Tensor, actions: Tensor) -> Tensor:
-        """(B, ...), (B, A) -> (2, B)."""
-        obs_mean, obs_std, middle, half = self.scale
-        return net(normalise(obs, obs_mean, obs_std), (actions - middle) / half)[:, :, 0]  # type: ignore[no-any-return]
-
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimiser, transitions and random state."""
         return {
             "net": module_state(self.net),
             "target": module_state(self.target),
-            "adam": self.descent.state_dict(),
+            "adam": self.twins.descent.state_dict(),
             "plain": self.plain.state_dict(),
             "events": self.events.state_dict(),
             "rng": rng_state(self.rng),
@@ -222,7 +210,7 @@ class Critic:
         """Restore what `state_dict` returned."""
         load_module_state(self.net, state["net"])
         load_module_state(self.target, state["target"])
-        self.descent.load_state_dict(state["adam"])
+        self.twins.descent.load_state_dict(state["adam"])
         self.plain.load_state_dict(state["plain"])
         self.events.load_state_dict(state["events"])
         set_rng_state(self.rng, state["rng"])

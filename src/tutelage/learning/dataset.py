@@ -82,16 +82,24 @@ class AggregatedDataset:
         for bag in self.bags:
             bag.append(np.repeat(index, self.rng.poisson(1.0, len(index))) if self.bootstrap else index)
 
-    def batches(self, size: int) -> tuple[Tensor, Tensor]:
-        """An independent batch for each member, drawn from its bag: obs (K, size, ...), actions (K, size, A)."""
+    def draw(self, size: int) -> NDArray[np.int64]:
+        """The rows of an independent batch for each member, drawn from its bag: (K, size).
+
+        Raises:
+            ConfigError: there are no data.
+        """
         if not len(self):
             raise ConfigError("there are no human data to learn from yet; give offline data or wait for interventions")
         # A bag can be empty only with a handful of pairs; its member then learns from all of them.
-        bags = [bag.rows if bag.size else torch.arange(len(self)) for bag in self.bags]
-        draws = torch.from_numpy(self.rng.integers(np.array([[len(bag)] for bag in bags]), size=(len(bags), size)))
-        index = torch.cat([bag.index_select(0, draw) for bag, draw in zip(bags, draws, strict=True)])
-        obs, actions = (rows.index_select(0, index) for rows in (self.obs.rows, self.actions.rows))
-        return obs.unflatten(0, draws.shape), actions.unflatten(0, draws.shape)
+        bags = [bag.rows.numpy() if bag.size else np.arange(len(self)) for bag in self.bags]
+        draws = self.rng.integers(np.array([[len(bag)] for bag in bags]), size=(len(bags), size))
+        return np.stack([bag[draw] for bag, draw in zip(bags, draws, strict=True)])
+
+    def batches(self, size: int) -> tuple[Tensor, Tensor]:
+        """An independent batch for each member: obs (K, size, ...), actions (K, size, A). Raises: see `draw`."""
+        index = torch.from_numpy(self.draw(size))
+        obs, actions = (rows.index_select(0, index.flatten()) for rows in (self.obs.rows, self.actions.rows))
+        return obs.unflatten(0, index.shape), actions.unflatten(0, index.shape)
 
     def state_dict(self) -> dict[str, Any]:
         """All pairs, bags and the random state."""

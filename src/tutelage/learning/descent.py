@@ -1,14 +1,22 @@
-"""Gradient descent on networks that learn side by side."""
+"""Gradient descent on networks that learn side by side: in compiled code, or by PyTorch's automatic differentiation."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from tutelage.cores import one_thread_a_product, workers
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
+from tutelage.policies.mlp import Arrays, BatchedMLP
 from tutelage.policies.networks import Network
+
+Array = NDArray[Any]
 
 
 class Descent:
@@ -39,3 +47,80 @@ class Descent:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         load_optimiser_state(self.optimiser, state)
+
+
+class CompiledDescent:
+    """Adam on K multilayer perceptrons of one shape, each in a thread of its own; see `learning.compiled`.
+
+    Args:
+        net: the networks. Their weights stay where they are: what loads others into `net` changes what is learned from.
+        learning_rate: of Adam.
+        threads: see `workers`.
+    """
+
+    def __init__(self, net: BatchedMLP, learning_rate: float, threads: int) -> None:
+        one_thread_a_product()
+        self._pool, self._learning_rate, self._steps = workers(threads), learning_rate, 0
+        self._weights, self._biases = net.arrays()
+        self._members = len(self._weights[0])
+        size = sum(weight[0].size + bias[0].size for weight, bias in zip(self._weights, self._biases, strict=True))
+        self._gradient, self._first, self._second = (np.zeros((self._members, size), np.float32) for _ in range(3))
+        self._values: Arrays = ()
+        self._deltas: Arrays = ()
+        self._futures: list[Future[float]] = []
+
+    def begin(self, kernel: Callable[..., float], batch: int, *data: Any) -> None:
+        """Start a step of every network in the background.
+
+        kernel: `imitate` or `criticise`; batch: how many pairs; data: the arguments of the kernel between k and weights.
+        """
+        if not self._values or self._values[0].shape[1] != batch:
+            self._values, self._deltas = self._rooms(batch)
+        self._steps += 1
+        rate = np.float32(self._learning_rate / (1 - 0.9**self._steps))
+        correction = np.float32(1 / np.sqrt(1 - 0.999**self._steps))
+        layers = self._weights, self._biases, self._values, self._deltas
+        adam = self._gradient, self._first, self._second, rate, correction
+        self._futures = [self._pool.submit(kernel, k, *data, *layers, *adam) for k in range(self._members)]
+
+    def end(self) -> float:
+        """Wait for what began; returns the mean of the losses before it."""
+        return sum(future.result() for future in self._futures) / self._members
+
+    def _rooms(self, batch: int) -> tuple[Arrays, Arrays]:
+        """Room for what the layers say of a batch, and for its gradients."""
+        inputs, *widths = self._weights[0].shape[1], *(weight.shape[2] for weight in self._weights)
+        values, deltas = (
+            tuple(np.empty((self._members, batch, width), np.float32) for width in row)
+            for row in ([inputs, *widths], widths)
+        )
+        return values, deltas
+
+    def state_dict(self) -> dict[str, Any]:
+        """The moments of each parameter of the K networks, by position (copies); nothing before the first step."""
+        if not self._steps:
+            return {}
+        moments = zip(self._parts(self._first), self._parts(self._second), strict=True)
+        return {
+            str(position): {"step": np.array(self._steps, np.float32), "exp_avg": first.copy(), "exp_avg_sq": second.copy()}
+            for position, (first, second) in enumerate(moments)
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self._steps = int(state["0"]["step"]) if state else 0
+        for name, flat in (("exp_avg", self._first), ("exp_avg_sq", self._second)):
+            for position, part in enumerate(self._parts(flat)):
+                part[:] = state[str(position)][name] if state else 0.0
+
+    def _parts(self, flat: Array) -> list[Array]:
+        """Views of (K, P) numbers as the parameters of the networks: all weights, then all biases."""
+        weights: list[Array] = []
+        biases: list[Array] = []
+        start = 0
+        for weight, bias in zip(self._weights, self._biases, strict=True):
+            for array, parts in ((weight, weights), (bias, biases)):
+                stop = start + array[0].size
+                parts.append(flat[:, start:stop].reshape(array.shape))
+                start = stop
+        return weights + biases

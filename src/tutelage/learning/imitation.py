@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tutelage.errors import ConfigError
@@ -15,7 +13,7 @@ from tutelage.fleet.step import Step
 from tutelage.learning.classifier import DiscrepancyClassifier
 from tutelage.learning.critic import Critic
 from tutelage.learning.dataset import AggregatedDataset
-from tutelage.learning.descent import Descent
+from tutelage.learning.regression import regression
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.policies.weights import load_module_state, module_state
 from tutelage.seeding import derive
@@ -35,8 +33,6 @@ class LearnerConfig:
         batch: pairs in a gradient step of a member.
         learning_rate: of Adam.
         pretrain: gradient steps of behaviour cloning on the offline data, before the run.
-        precision: of the matrix products in updates during the run. "bfloat16" has 8 bits and sums in 32; it is faster on
-            processors that have such products (AMX, AVX512-BF16) and changes nothing on others.
     """
 
     schedule: Literal["step", "episode", "scratch", "never"] = "step"
@@ -45,13 +41,10 @@ class LearnerConfig:
     batch: int = 256
     learning_rate: float = 3e-4
     pretrain: int = 1000
-    precision: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
         if self.schedule not in ("step", "episode", "scratch", "never"):
             raise ConfigError(f"unknown schedule {self.schedule!r}: use step, episode, scratch or never")
-        if self.precision not in ("float32", "bfloat16"):
-            raise ConfigError(f"unknown precision {self.precision!r}: use float32 or bfloat16")
         if min(self.every, self.gradient_steps, self.batch) < 1 or self.pretrain < 0 or not self.learning_rate > 0:
             raise ConfigError("learning needs every, gradient_steps and batch >= 1, pretrain >= 0 and learning_rate > 0")
 
@@ -79,16 +72,20 @@ class ImitationLearner:
     ) -> None:
         self.policy, self.dataset, self.config, self.seed = policy, dataset, config, seed
         self.critics, self.classifier = critics or {}, classifier
-        self.descent = Descent(policy.net, config.learning_rate)
+        self.regression = regression(policy, config.learning_rate)
         self.restarts, self._episode_ended = 0, False
         self._heard: int | None = None
+        """The timestep whose human data are in the dataset already."""
+        self._begun: int | None = None
+        """The timestep whose first gradient step has begun and has not ended."""
 
     def gradient_steps(self, n: int) -> float:
         """n gradient steps of behaviour cloning on all data so far; returns the last loss, mean over members."""
-        loss = 0.0
-        for _ in range(n):
-            obs, actions = self.dataset.batches(self.config.batch)
-            loss = self.descent.step(self.policy.loss(obs, actions))
+        for k in range(n):
+            if k or self._begun is None:
+                self.regression.begin(self.dataset, self.config.batch)
+            loss = self.regression.end()
+        self._begun = None
         self.policy.forget()
         return loss
 
@@ -96,15 +93,23 @@ class ImitationLearner:
         """New initial weights and a new optimiser; the data stay."""
         self.restarts += 1
         self.policy.restart(derive(self.seed, f"policy/restart {self.restarts}"))
-        self.descent = Descent(self.policy.net, self.config.learning_rate)
+        self.regression = regression(self.policy, self.config.learning_rate)
 
     # -- the Learner of the loop --------------------------------------------------------------------------------
 
-    def hear(self, t: int, obs: Array, wanted: Array) -> dict[str, float]:
-        """Human actions into the dataset; the policy learns from them at once, unless its schedule waits for the outcome."""
+    def hear(self, t: int, obs: Array, wanted: Array) -> None:
+        """Human actions into the dataset, before their outcome is known."""
         self._heard = t
         self._add(obs, wanted)
-        return {} if self.config.schedule == "episode" else self._precisely(self._imitate, t)
+
+    def begin(self, t: int) -> None:
+        """Start what is due of the policy at timestep t, unless its schedule waits for the outcome; `update` ends it."""
+        self._settle()
+        if self.config.schedule != "episode" and self._due(t):
+            if self.config.schedule == "scratch":
+                self.restart()
+            self.regression.begin(self.dataset, self.config.batch)
+            self._begun = t
 
     def record(self, step: Step) -> None:
         """Human actions into the dataset, unless they were heard; every transition into the critics."""
@@ -120,34 +125,28 @@ class ImitationLearner:
                 critic.add(obs, action, after, event, end=violation | (success & ~step.truncated[moved]))
 
     def update(self, t: int) -> dict[str, float]:
-        """What is due at timestep t, less what `hear` did already."""
-        return self._precisely(self._improve, t)
-
-    def _add(self, obs: Array, wanted: Array) -> None:
-        if len(obs):
-            self.dataset.add(obs, wanted)
-
-    def _precisely(self, work: Callable[[int], dict[str, float]], t: int) -> dict[str, float]:
-        """Work at timestep t with matrix products of the precision that the configuration asks for."""
-        if self.config.precision == "float32":
-            return work(t)
-        torch.set_float32_matmul_precision("medium")  # of this process, so only while nothing else computes
-        try:
-            return work(t)
-        finally:
-            torch.set_float32_matmul_precision("highest")
-
-    def _improve(self, t: int) -> dict[str, float]:
-        done = self._heard == t and self.config.schedule != "episode"
-        losses = {} if done else self._imitate(t)
+        """What is due at timestep t: the policy, the classifier, which follows it, and the critics, which ask it."""
+        losses: dict[str, float] = {}
+        c = self.config
+        if self._begun is not None or self._due(t):
+            if self._begun is None and c.schedule == "scratch":
+                self.restart()
+            losses["policy"] = self.gradient_steps(c.gradient_steps)
+            if self.classifier:
+                losses["classifier"] = self.classifier.updates(c.gradient_steps)
         for name, critic in self.critics.items():
-            if self.config.schedule != "never" and (t + 1) % critic.config.every == 0:
+            if c.schedule != "never" and (t + 1) % critic.config.every == 0:
                 losses[name] = critic.update()
         return {name: loss for name, loss in losses.items() if np.isfinite(loss)}
 
-    def _imitate(self, t: int) -> dict[str, float]:
-        """The policy, and the classifier, which follows it."""
-        losses: dict[str, float] = {}
+    def _settle(self) -> None:
+        """Wait for what began in a timestep that was given up before its end."""
+        if self._begun is not None:
+            self.regression.end()
+            self._begun = None
+
+    def _due(self, t: int) -> bool:
+        """Whether the policy learns at timestep t."""
         c = self.config
         due = {
             "step": (t + 1) % c.every == 0,
@@ -155,18 +154,16 @@ class ImitationLearner:
             "episode": self._episode_ended,
             "never": False,
         }[c.schedule]
-        if due and len(self.dataset):
-            if c.schedule == "scratch":
-                self.restart()
-            losses["policy"] = self.gradient_steps(c.gradient_steps)
-            if self.classifier:
-                losses["classifier"] = self.classifier.updates(c.gradient_steps)
-        return {name: loss for name, loss in losses.items() if np.isfinite(loss)}
+        return due and len(self.dataset) > 0
+
+    def _add(self, obs: Array, wanted: Array) -> None:
+        if len(obs):
+            self.dataset.add(obs, wanted)
 
     def state_dict(self) -> dict[str, Any]:
         return {
             "policy": module_state(self.policy),
-            "adam": self.descent.state_dict(),
+            "adam": self.regression.state_dict(),
             "dataset": self.dataset.state_dict(),
             "critics": {name: critic.state_dict() for name, critic in self.critics.items()},
             **({"classifier": self.classifier.state_dict()} if self.classifier else {}),
@@ -175,9 +172,10 @@ class ImitationLearner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._settle()
         load_module_state(self.policy, state["policy"])
         self.policy.forget()
-        self.descent.load_state_dict(state["adam"])
+        self.regression.load_state_dict(state["adam"])
         self.dataset.load_state_dict(state["dataset"])
         for name, critic in self.critics.items():
             critic.load_state_dict(state["critics"][name])

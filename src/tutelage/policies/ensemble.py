@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from tutelage.cores import available_cores
 from tutelage.errors import ContractError
+from tutelage.policies.mlp import BatchedMLP
 from tutelage.policies.networks import Network, Shape, as_tensor, hidden_layers, network, normalise, shape_of
 from tutelage.policies.weights import load_module_state, load_weights, save_policy
 
@@ -25,6 +28,7 @@ class EnsemblePolicy(nn.Module):
         members: K.
         hidden: widths of the (fully connected) hidden layers; default: 256 and 256, for images 100, 50 and 10.
         seed: of the initial weights.
+        threads: see `workers`; default: one a core. Networks that see vectors are asked, and learn, in them.
     """
 
     def __init__(
@@ -36,6 +40,7 @@ class EnsemblePolicy(nn.Module):
         members: int = 5,
         hidden: tuple[int, ...] | None = None,
         seed: int = 0,
+        threads: int | None = None,
     ) -> None:
         super().__init__()
         self.action_middle: Tensor
@@ -43,7 +48,7 @@ class EnsemblePolicy(nn.Module):
         self.obs_mean: Tensor
         self.obs_std: Tensor
         self.members, self.obs_shape, self.hidden = members, shape_of(obs), hidden_layers(obs, hidden)
-        self.outputs = len(action_low)
+        self.outputs, self.threads = len(action_low), threads or available_cores()
         self.net = self._network(seed)
         low, high = torch.as_tensor(action_low).float(), torch.as_tensor(action_high).float()
         self.register_buffer("action_middle", (high + low) / 2)
@@ -51,7 +56,7 @@ class EnsemblePolicy(nn.Module):
         self.register_buffer("obs_mean", torch.zeros(self.obs_shape[-1]))
         self.register_buffer("obs_std", torch.ones(self.obs_shape[-1]))
         self._seen: Array | None = None
-        self._said = torch.empty(0)
+        self._said: tuple[Array, Array] = np.empty(0), np.empty(0)
 
     def _network(self, seed: int) -> Network:
         generator = torch.Generator().manual_seed(seed)
@@ -112,19 +117,39 @@ class EnsemblePolicy(nn.Module):
         """Drop the memory of the last observations: call after the weights changed."""
         self._seen = None
 
-    @torch.no_grad()
-    def _ask(self, obs: Array) -> Tensor:
-        """What each member would do, (K, N, A) in units of half the range; one pass for `act` and `uncertainty`."""
+    @property
+    def scale(self) -> tuple[Array, Array, Array, Array]:
+        """What normalises: mean, std (D,) of observations, middle, half (A,) of the range of actions; shared memory."""
+        return self.obs_mean.numpy(), self.obs_std.numpy(), self.action_middle.numpy(), self.action_half.numpy()
+
+    def _ask(self, obs: Array) -> tuple[Array, Array]:
+        """The mean of the members (N, A), and their variance (N,); one pass for `act` and `uncertainty`."""
         if self._seen is not obs:
-            self._said = self.net(self.normalise(as_tensor(obs)))
+            self._said = self._ask_compiled(obs, self.net) if isinstance(self.net, BatchedMLP) else self._ask_torch(obs)
             self._seen = obs
         return self._said
 
+    def _ask_compiled(self, obs: Array, net: BatchedMLP) -> tuple[Array, Array]:
+        from tutelage.policies.compiled import ask_all, mean_and_variance, member
+
+        obs, (mean, std, middle, half) = np.ascontiguousarray(obs, dtype=np.float32), self.scale
+        said = np.empty((self.members, len(obs), self.outputs), np.float32)
+        ask_all(member, self.members, len(obs), self.threads, obs, mean, std, *net.arrays(), said)
+        action, variance = np.empty(said.shape[1:], np.float32), np.empty(len(obs), np.float32)
+        mean_and_variance(said, middle, half, action, variance)
+        return action, variance
+
+    @torch.no_grad()
+    def _ask_torch(self, obs: Array) -> tuple[Array, Array]:
+        said = self.net(self.normalise(as_tensor(obs)))
+        action = self.action_middle + self.action_half * said.mean(dim=0)
+        return action.numpy(), said.var(dim=0, correction=0).mean(dim=-1).numpy()
+
     def act(self, obs: Array) -> Array:
         """The mean of the members: (N, D) or (N, H, W, 3) -> (N, A) float32."""
-        return (self.action_middle + self.action_half * self._ask(obs).mean(dim=0)).numpy()
+        return self._ask(obs)[0]
 
     def uncertainty(self, obs: Array) -> Array:
         """Ensemble variance, mean over actions, in units of the variance of the pair {low, high}: (N,), 0 to 1."""
         # Members speak in units of half the range, whose pair {-1, 1} has variance 1: no further division.
-        return self._ask(obs).var(dim=0, correction=0).mean(dim=-1).numpy()
+        return self._ask(obs)[1]

@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
+
+Arrays = tuple[NDArray[Any], ...]
 
 
 class BatchedMLP(nn.Module):
@@ -56,3 +60,8 @@ class BatchedMLP(nn.Module):
             if k < len(self._layers) - 1:
                 x = self.activation(x)
         return self.last(x) if self.last else x
+
+    def arrays(self) -> tuple[Arrays, Arrays]:
+        """Weights (K, a, b) and biases (K, 1, b) of each layer as arrays, which share their memory with the parameters."""
+        weights, biases = zip(*((w.detach().numpy(), b.detach().numpy()) for w, b in self._layers), strict=True)
+        return weights, biases

@@ -220,8 +220,6 @@ def _evolve(config: SearchConfig, gaits: Array, generations: int, noise: float) 
                 f"{config.steps / 20:.0f} s, fails in {(lost > LOSS).mean():.0%}",
                 flush=True,
             )
-    trial.physics.close()
-    check.physics.close()
     return evolution.mean.reshape(gaits.shape)
 
 

@@ -1,0 +1,155 @@
+"""Gradient steps of multilayer perceptrons as compiled code: the forward pass, backpropagation and Adam.
+
+A step holds no interpreter lock from its first number to its last, so networks learn side by side in threads, beside
+physics. Each network's numbers come from one thread in one order: the same whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from tutelage.policies.compiled import FAST, ONE, RECTIFIED, SIGMOID, TANH, ZERO, join, layer, normalise_row
+
+BETA_1, BETA_2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-8)
+"""Of Adam, as in PyTorch."""
+TWO = np.float32(2)
+
+
+@numba.njit(nogil=True, cache=True)
+def imitate(  # type: ignore[no-untyped-def]
+    k, obs, actions, index, mean, std, middle, half,
+    weights, biases, values, deltas, gradient, first, second, rate, correction,
+):  # fmt: skip
+    """One step of tanh network k towards the human actions in its batch (eq. 5.3); returns its mean squared error before.
+
+    Args:
+        k: which of the K networks.
+        obs, actions: (n, D) and (n, A) float32: all data.
+        index: (K, B): the rows that each network's batch consists of.
+        mean, std: (D,), to normalise observations; middle, half: (A,): errors are in units of half the range of actions.
+        weights, and all that follows: see `_descend`.
+    """
+    for i in range(index.shape[1]):
+        normalise_row(obs[index[k, i]], mean, std, values[0][k, i])
+    _forward(k, weights, biases, values, TANH)
+    loss = _imitation_error(values[-1][k], actions, index[k], middle, half, deltas[-1][k])
+    _descend(k, weights, biases, values, deltas, gradient, first, second, rate, correction)
+    return loss
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST)
+def _imitation_error(said, actions, index, middle, half, delta):  # type: ignore[no-untyped-def]
+    """The mean squared error of `said` (B, A), and into delta its gradient with respect to the sums before tanh."""
+    loss, scale = 0.0, TWO / np.float32(said.size)
+    for i in range(said.shape[0]):
+        for j in range(said.shape[1]):
+            error = said[i, j] - (actions[index[i], j] - middle[j]) / half[j]
+            loss += error * error
+            delta[i, j] = scale * error * (ONE - said[i, j] * said[i, j])
+    return loss / said.size
+
+
+@numba.njit(nogil=True, cache=True)
+def criticise(  # type: ignore[no-untyped-def]
+    k, obs, actions, target, mean, std, middle, half, slow_weights, slow_biases, tau,
+    weights, biases, values, deltas, gradient, first, second, rate, correction,
+):  # fmt: skip
+    """One step of critic k towards `target`, and of its slow copy towards it; returns its mean squared error before.
+
+    Args:
+        k: which of the K sigmoid networks.
+        obs, actions, target: (B, D), (B, A) and (B,) float32: the batch of all networks.
+        mean, std, middle, half: see `imitate`.
+        slow_weights, slow_biases, tau: the target network, which goes tau of the way.
+        weights, and all that follows: see `_descend`.
+    """
+    for i in range(len(target)):
+        join(obs[i], actions[i], mean, std, middle, half, values[0][k, i])
+    _forward(k, weights, biases, values, SIGMOID)
+    loss = _critic_error(values[-1][k], target, deltas[-1][k])
+    _descend(k, weights, biases, values, deltas, gradient, first, second, rate, correction)
+    for number in range(len(weights)):
+        _approach(slow_weights[number][k].ravel(), weights[number][k].ravel(), tau)
+        _approach(slow_biases[number][k].ravel(), biases[number][k].ravel(), tau)
+    return loss
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST)
+def _critic_error(said, target, delta):  # type: ignore[no-untyped-def]
+    """The mean squared error of `said` (B, 1), and into delta its gradient with respect to the sums before the sigmoid."""
+    loss, scale = 0.0, TWO / np.float32(said.size)
+    for i in range(said.shape[0]):
+        error = said[i, 0] - target[i]
+        loss += error * error
+        delta[i, 0] = scale * error * said[i, 0] * (ONE - said[i, 0])
+    return loss / said.size
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST)
+def _approach(slow, fast, tau):  # type: ignore[no-untyped-def]
+    """slow goes tau of the way to fast, (n,) each."""
+    for i in range(slow.shape[0]):
+        slow[i] += tau * (fast[i] - slow[i])
+
+
+@numba.njit(nogil=True, cache=True)
+def _forward(k, weights, biases, values, kind):  # type: ignore[no-untyped-def]
+    """What each layer of network k says, from values[0] on; the last is of the given kind, all others are rectified."""
+    last = len(weights) - 1
+    for number in range(last + 1):
+        now = kind if number == last else RECTIFIED
+        layer(values[number][k], weights[number][k], biases[number][k, 0], now, values[number + 1][k])
+
+
+@numba.njit(nogil=True, cache=True)
+def _descend(k, weights, biases, values, deltas, gradient, first, second, rate, correction):  # type: ignore[no-untyped-def]
+    """Network k goes one step of Adam down the gradient that deltas[-1] begins. All arrays are float32 and contiguous.
+
+    Args:
+        weights, biases: a layer's (K, a, b) and (K, 1, b), for each layer; changed.
+        values: (K, B, D), then (K, B, b) for each layer: what it says.
+        deltas: (K, B, b) for each layer: the gradient with respect to its sums; room for all but the last.
+        gradient: (K, P): room for the gradient of each layer's weights and then its biases.
+        first, second: (K, P): Adam's moments, in the same order; changed.
+        rate: learning rate / (1 - beta_1^t), correction: 1 / sqrt(1 - beta_2^t), at Adam's step t.
+    """
+    stop = gradient.shape[1]
+    for number in range(len(weights) - 1, -1, -1):
+        a, b = weights[number].shape[1:]
+        start, between = stop - (a + 1) * b, stop - b
+        np.dot(values[number][k].T, deltas[number][k], gradient[k, start:between].reshape((a, b)))
+        _sum_rows(deltas[number][k], gradient[k, between:stop])
+        if number:  # before the weights change
+            np.dot(deltas[number][k], weights[number][k].T, deltas[number - 1][k])
+            _mask(deltas[number - 1][k], values[number][k])
+        for parameter, i, j in ((weights[number][k].ravel(), start, between), (biases[number][k].ravel(), between, stop)):
+            _adam(parameter, gradient[k, i:j], first[k, i:j], second[k, i:j], rate, correction)
+        stop = start
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST)
+def _mask(delta, hidden):  # type: ignore[no-untyped-def]
+    """The gradient after a rectifier becomes the one before it, in place: nothing passes where it gave 0. (B, b) each."""
+    for i in range(delta.shape[0]):
+        for j in range(delta.shape[1]):
+            delta[i, j] = delta[i, j] if hidden[i, j] > ZERO else ZERO
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST)
+def _sum_rows(x, total):  # type: ignore[no-untyped-def]
+    """(B, b) -> (b,)."""
+    total[:] = ZERO
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            total[j] += x[i, j]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST)
+def _adam(parameter, gradient, first, second, rate, correction):  # type: ignore[no-untyped-def]
+    """Adam on n numbers, in place."""
+    for i in range(parameter.shape[0]):
+        g = gradient[i]
+        first[i] += (ONE - BETA_1) * (g - first[i])
+        second[i] = BETA_2 * second[i] + (ONE - BETA_2) * g * g
+        parameter[i] -= rate * first[i] / (np.sqrt(second[i]) * correction + EPSILON)
