@@ -19,6 +19,7 @@ from small import FLAGS, assert_same, points, walker
 
 import tutelage
 from tutelage import cli
+from tutelage.envs.registry import ON_EXTRAS
 from tutelage.envs.tasks import TASKS
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.recording import lock
@@ -141,7 +142,10 @@ def test_info(tut: Callable[..., Said], monkeypatch: pytest.MonkeyPatch) -> None
     tasks = tut("info").out
     assert tasks == tut("info", "tasks").out
     assert re.search(r"^ Walker2d +17 +6 +1000 +moderate +expert +\d+ \(published 3492\) +\d+% of 100 ", tasks, re.MULTILINE)
-    assert [line.split()[0] for line in tasks.splitlines()[1:]] == [*TASKS]
+    *listed, robosuite, envpool = tasks.splitlines()[1:]
+    assert [line.split()[0] for line in listed] == [*TASKS]
+    assert robosuite == "with the extra robosuite: NutAssemblyRound"
+    assert envpool == "with the extra envpool: Go1Joystick, SpotJoystick, LeapCubeReorient, PandaPickCube"
     monkeypatch.setattr(cli, "_speed", lambda task: "12,345")
     measured = tut("info", "tasks", "--speed").out
     assert re.search(r"steps/s here +what *$", measured.splitlines()[0])
@@ -272,7 +276,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
     [
         (
             ["run", "Walkr2d"],
-            f"unknown task 'Walkr2d' (did you mean Walker2d?); tasks: {', '.join(TASKS)}, NutAssemblyRound, "
+            f"unknown task 'Walkr2d' (did you mean Walker2d?); tasks: {', '.join([*TASKS, *ON_EXTRAS])}, "
             "or your own as module:callable",
         ),
         (

@@ -256,7 +256,7 @@ def info(what: Positional[Literal["tasks", "levels", "priorities", "version"]] =
         rows += [[name, (gate.__doc__ or "").splitlines()[0]] for name, gate in GATES.items()]
         _print_table(["term", "meaning"], rows)
     else:
-        from tutelage.envs.registry import make_fleet
+        from tutelage.envs.registry import EXTRAS, make_fleet
         from tutelage.envs.tasks import TASKS
 
         rows = []
@@ -269,6 +269,8 @@ def info(what: Positional[Literal["tasks", "levels", "priorities", "version"]] =
         head = ["task", "obs", "actions", "horizon", "level", "supervisor", "return in calm", "success at level"]
         head += ["steps/s here", "what"] if speed else ["what"]
         _print_table(head, rows)
+        for extra, tasks in EXTRAS.items():
+            console.print(f"with the extra {extra}: {', '.join(tasks)}")
 
 
 def _speed(task: str) -> str:

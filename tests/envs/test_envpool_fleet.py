@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tutelage.checks import check_env
+from tutelage.envs.registry import make_fleet
 from tutelage.errors import ConfigError, MissingExtraError
 
 
@@ -78,3 +79,65 @@ def test_mistakes_are_named() -> None:
     with pytest.raises(ConfigError, match="seeded for all robots only"):
         fleet.reset(seed=1, options={"reset_mask": np.array([True, False])})
     fleet.close()
+
+
+# -- tasks by name --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "obs", "actions"),
+    [("Go1Joystick", 48, 12), ("SpotJoystick", 81, 12), ("LeapCubeReorient", 57, 16), ("PandaPickCube", 66, 8)],
+)
+def test_tasks_of_playground_are_fleets_by_name(task: str, obs: int, actions: int) -> None:
+    pytest.importorskip("envpool")
+    fleet = make_fleet(task, 4, threads=1, horizon=40)
+    assert (fleet.single_observation_space.shape, fleet.single_action_space.shape) == ((obs,), (actions,))
+    check_env(fleet)
+    fleet.close()
+
+
+def test_a_quadruped_that_is_thrown_about_falls_and_one_that_stands_has_not_followed() -> None:
+    pytest.importorskip("envpool")
+    fleet = make_fleet("Go1Joystick", 20, threads=2, horizon=150)
+    assert fleet.success_return == pytest.approx(0.5 * 1.5 * 0.02 * 150)
+    fleet.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        *_, truncated, info = fleet.step(rng.uniform(-1, 1, (20, 12)))
+    assert info["violation"].sum() > 10
+    assert not info["success"].any()
+    assert not (truncated & info["violation"]).any()
+    fleet.reset(seed=1)
+    for _ in range(150):
+        *_, truncated, info = fleet.step(np.zeros((20, 12)))
+    assert (truncated & ~info["violation"]).sum() > 10
+    assert not info["success"][info["return"] < fleet.success_return].any()
+    fleet.close()
+    generous = make_fleet("Go1Joystick", 2, threads=1, horizon=5, success_return=-np.inf)
+    generous.reset(seed=0)
+    for _ in range(5):
+        *_, info = generous.step(np.zeros((2, 12)))
+    assert info["success"].all()
+    generous.close()
+
+
+def test_a_hand_that_does_nothing_useful_drops_the_cube() -> None:
+    pytest.importorskip("envpool")
+    fleet = make_fleet("LeapCubeReorient", 10, threads=2)
+    fleet.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        *_, info = fleet.step(rng.uniform(-1, 1, (10, 16)))
+    assert info["violation"].sum() > 5
+    assert (info["success_count"] == info["success"]).all()
+    fleet.close()
+
+
+def test_which_observation_must_be_said_where_there_are_several() -> None:
+    for task, observe, said in (
+        ("Go1JoystickFlatTerrain-v1", None, "observe one of state, privileged_state"),
+        ("Go1JoystickFlatTerrain-v1", "pixels", "observe one of state, privileged_state"),
+        ("Walker2d-v4", "state", "leave `observe` out"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            make(task, observe=observe)

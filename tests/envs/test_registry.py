@@ -9,7 +9,7 @@ import pytest
 from fakes import PointFleet
 
 from tutelage.envs import registry
-from tutelage.envs.registry import make_fleet, task_names
+from tutelage.envs.registry import ON_EXTRAS, make_fleet, task_names
 from tutelage.envs.task_fleet import TaskFleet
 from tutelage.envs.tasks import TASKS, Walker2d
 from tutelage.errors import ConfigError, ContractError
@@ -52,7 +52,7 @@ def test_a_task_class_of_a_module_takes_what_a_built_in_one_takes() -> None:
 def test_tasks_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint("Points", f"{__name__}:points", registry.GROUP)
     monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == registry.GROUP else [])
-    assert task_names() == [*TASKS, "NutAssemblyRound", "Points"]
+    assert task_names() == [*TASKS, *ON_EXTRAS, "Points"]
     assert make_fleet("Points", 2).num_envs == 2
     with pytest.raises(ConfigError, match=r"unknown task 'Point' \(did you mean Points\?\); tasks: HalfCheetah, .*, Points"):
         make_fleet("Point", 2)

@@ -38,7 +38,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "overlap": {"overlap": True, "learner": {"schedule": "episode"}, "robots": 8},
-    "threads": {"torch_threads": 2},
+    "threads": {"threads": 3},
     "latency": {"latency": 2, "supervisor_noise": 0.3},
     "scratch": {"learner": {"schedule": "scratch", "every": 7, "gradient_steps": 3}, "overlap": True},
     "everything": {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,9 +34,12 @@ class EnvPoolFleet(AdaptedFleet):
         num_envs: N robots.
         violation: which robots violated their constraint in a timestep, from an `Outcome`: (N,) bool.
         success: which robots completed the task in a timestep, likewise.
+        observe: the entry that robots see, of tasks that observe a dictionary of arrays.
         horizon: timesteps of an episode; default: the task's own.
         threads: physics threads; default: EnvPool's choice.
         kwargs: the task's own settings.
+
+    `settings` are all of the task's own, those that were not given too.
     """
 
     def __init__(
@@ -45,6 +49,7 @@ class EnvPoolFleet(AdaptedFleet):
         *,
         violation: Judge,
         success: Judge,
+        observe: str | None = None,
         horizon: int | None = None,
         threads: int | None = None,
         **kwargs: Any,
@@ -58,17 +63,27 @@ class EnvPoolFleet(AdaptedFleet):
             raise ConfigError(f"a fleet needs at least one robot, got {num_envs}")
         if horizon is not None:
             kwargs["max_episode_steps"] = horizon
-        super().__init__(_Pool(task_id, num_envs, threads, kwargs), violation, success)
+        pool = _Pool(task_id, num_envs, observe, threads, kwargs)
+        super().__init__(pool, violation, success)
+        self.settings = pool.settings
 
 
 class _Pool(Backend):
     """One pool in its synchronous mode, where any subset of robots may be sent and exactly that subset comes back."""
 
-    def __init__(self, task_id: str, num_envs: int, threads: int | None, kwargs: dict[str, Any]) -> None:
-        self._task, self.num_envs = task_id, num_envs
+    def __init__(
+        self, task_id: str, num_envs: int, observe: str | None, threads: int | None, kwargs: dict[str, Any]
+    ) -> None:
+        self._task, self.num_envs, self._observe = task_id, num_envs, observe
         self._settings = {**kwargs, **({} if threads is None else {"num_threads": threads})}
         spec = envpool.make_spec(task_id, num_envs=num_envs, **self._settings)
-        self.obs_space, self.action_space = spec.gymnasium_observation_space, spec.gymnasium_action_space
+        seen, self.action_space = spec.gymnasium_observation_space, spec.gymnasium_action_space
+        parts = seen.spaces if isinstance(seen, gym.spaces.Dict) else {}
+        if (observe is None or observe not in parts) if parts else (observe is not None):
+            which = f"observe one of {', '.join(parts)}" if parts else "it observes one array, so leave `observe` out"
+            raise ConfigError(f"EnvPool's {task_id} has no observation {observe!r}: {which}")
+        self.obs_space = parts[observe] if observe is not None else seen
+        self.settings: dict[str, Any] = spec.config._asdict()
         self.horizon = int(spec.config.max_episode_steps)
         self._pool: Any = None
 
@@ -86,7 +101,7 @@ class _Pool(Backend):
                 **self._settings,
             )
         obs, info = self._pool.reset(np.flatnonzero(robots).astype(np.int32))
-        return self._scatter(obs, info)
+        return self._scatter(self._part(obs), info)
 
     def start(self, actions: Array, robots: Mask) -> None:
         moving = np.flatnonzero(robots).astype(np.int32)
@@ -95,8 +110,12 @@ class _Pool(Backend):
     def finish(self) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self._pool.recv()
         batched = {k: self._scatter(v, info) for k, v in info.items() if isinstance(v, np.ndarray) and k != "env_id"}
-        rows = (self._scatter(x, info) for x in (obs, reward, terminated, truncated))
+        rows = (self._scatter(x, info) for x in (self._part(obs), reward, terminated, truncated))
         return (*rows, batched)  # type: ignore[return-value]
+
+    def _part(self, obs: Any) -> Array:
+        """What robots see of what EnvPool observes."""
+        return obs if self._observe is None else obs[self._observe]  # type: ignore[no-any-return]
 
     def _scatter(self, rows: Array, info: dict[str, Any]) -> Array:
         """Rows of the robots that answered, in whatever order, as rows of all robots."""

@@ -16,8 +16,15 @@ from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet
 
-ON_EXTRAS = {"NutAssemblyRound": "tutelage.envs.robosuite_fleet:NutAssemblyRound"}
-"""Tasks on simulators that come with an extra, which need not be installed: what makes their fleets."""
+EXTRAS = {
+    "robosuite": {"NutAssemblyRound": "tutelage.envs.robosuite_fleet:NutAssemblyRound"},
+    "envpool": {
+        name: f"tutelage.envs.envpool_tasks:{name}"
+        for name in ("Go1Joystick", "SpotJoystick", "LeapCubeReorient", "PandaPickCube")
+    },
+}
+"""Tasks on simulators that come with an extra, which need not be installed: what makes their fleets, by extra."""
+ON_EXTRAS = {name: made_by for tasks in EXTRAS.values() for name, made_by in tasks.items()}
 
 GROUP = "tutelage.tasks"
 """Entry points of this group are tasks. Each names what "module:callable" may name; see `make_fleet`."""
@@ -40,8 +47,8 @@ def make_fleet(
     """A fleet of `num_envs` robots.
 
     Args:
-        task: a built-in task ("Walker2d"), one on an extra ("NutAssemblyRound"), the name of an entry point of the group
-            "tutelage.tasks", or "module:callable". The callable is a subclass of `Task`, or is called as
+        task: a built-in task ("Walker2d"), one on an extra ("NutAssemblyRound", "Go1Joystick"), the name of an entry point
+            of the group "tutelage.tasks", or "module:callable". The callable is a subclass of `Task`, or is called as
             `callable(num_envs, **kwargs)` and returns a `Fleet`.
         num_envs: N robots.
         disturbance: for the built-in tasks, see `TaskFleet`. Handed to a callable only when given, like `threads`.

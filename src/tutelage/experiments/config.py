@@ -61,8 +61,8 @@ class RunConfig:
         expert: the algorithmic humans: a file of weights, or module:function that returns a policy; default: the weights
             shipped with the task.
         overlap: learn everything while physics runs (the update at step t then sees the data up to t - 1).
-        threads: threads of physics, in which the policy learns as well; default: all cores.
-        torch_threads: threads of all other matrix products; default: all cores, at most 4.
+        threads: threads in which physics runs, and policy and critics learn from vectors; default: one a core.
+        torch_threads: threads of each matrix product of networks that see images; default: all cores, at most 4.
         out: run folder; default: runs/TASK-PRIORITY-sSEED, or runs/TASK-images-PRIORITY-sSEED.
         checkpoint_every: timesteps between checkpoints.
         metrics_every: timesteps between lines of metrics.jsonl.

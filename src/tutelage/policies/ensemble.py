@@ -57,6 +57,9 @@ class EnsemblePolicy(nn.Module):
         self.register_buffer("obs_std", torch.ones(self.obs_shape[-1]))
         self._seen: Array | None = None
         self._said: tuple[Array, Array] = np.empty(0), np.empty(0)
+        if isinstance(self.net, BatchedMLP):  # what is compiled on first use is compiled now, not while robots wait
+            self.act(np.zeros((1, *self.obs_shape), np.float32))
+            self.forget()
 
     def _network(self, seed: int) -> Network:
         generator = torch.Generator().manual_seed(seed)

@@ -119,6 +119,7 @@ class PulledPolicy:
         """
         node.access.entry(topics.WEIGHTS)
         self.node = node
+        EnsemblePolicy(1, np.array([-1.0]), np.array([1.0]), members=1)  # compiles, or loads what is: before the robot moves
         self._now: tuple[int, EnsemblePolicy | None] = (0, None)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._fetch, name="robot-policy", daemon=True)
