@@ -130,7 +130,7 @@ def learner_in(folder: Path) -> ImitationLearner:
     served = _served(folder)
     try:
         low, high = (np.array(served[name], dtype=np.float32) for name in ("low", "high"))
-        config = dataclasses.replace(read_config(folder), torch_threads=1)
+        config = dataclasses.replace(read_config(folder), threads=1)  # of the others robots and people have need
         return learner_of(config, tuple(served["shape"]), low, high)
     except (LookupError, TypeError, ValueError):
         raise RunFolderError(f"{folder / SERVED} is damaged; restore it, or choose another --out") from None
