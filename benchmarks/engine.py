@@ -12,7 +12,6 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from benchmarks.timing import table, take_turns
-from tutelage.envs.engine import wait
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.tasks import MUJOCO
 from tutelage.envs.tasks.base import GYMNASIUM
@@ -84,7 +83,7 @@ def _physics(fleet: MujocoFleet, actions: np.ndarray) -> None:
     """The compiled loop over robots alone: no observations, rewards or falls."""
     everyone = np.arange(fleet.num_envs)
     for a in actions:
-        wait(fleet.physics.advance_async(everyone, a, None, fleet.task.frame_skip))
+        fleet.physics.advance_async(everyone, a, None, fleet.task.frame_skip).results()
 
 
 def _rollout(fleet: MujocoFleet, actions: np.ndarray) -> Callable[[], None]:

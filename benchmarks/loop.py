@@ -12,9 +12,7 @@ import torch
 from benchmarks.fleets import OFFLINE, ready
 from benchmarks.original_loop import OriginalLoop
 from benchmarks.timing import Phases, ratio, table, take_turns
-from tutelage.cores import default_torch_threads
-from tutelage.envs import mujoco_fleet
-from tutelage.envs.engine import wait
+from tutelage.cores import Together, default_torch_threads
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.experiments.assemble import Assembly
 from tutelage.fleet.loop import Loop
@@ -91,7 +89,7 @@ class RawPhysics:
     def __call__(self) -> None:
         for kind, arguments in self.calls:
             if kind == "advance":
-                wait(self.physics.advance_async(*arguments))
+                self.physics.advance_async(*arguments).results()
             else:
                 self.physics.restart(*arguments)
 
@@ -134,7 +132,16 @@ def watch(ours: Ours) -> Phases:
     phases.watch(fleet, "step_async", "task code")
     phases.watch(fleet, "step_wait", "task code")
     phases.watch(fleet, "reset", "reset")
-    phases.watch(fleet.physics, "restart", "reset")  # type: ignore[attr-defined]
+    physics = fleet.physics  # type: ignore[attr-defined]
+    phases.watch(physics, "restart", "reset")
+    advance = physics.advance_async
+
+    def watched(*arguments: Any) -> Together:
+        moves = advance(*arguments)
+        phases.watch(moves, "results", TOGETHER)
+        return moves
+
+    physics.advance_async = watched
     phases.watch(learner, "record", "record")
     phases.watch(learner, "hear", "record")
     phases.watch(learner.regression, "begin", "sampling")
@@ -180,20 +187,14 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
         counter.counts.clear()
 
     phases = watch(lockstep)
-    timed = phases.timed(wait, TOGETHER)
-    mujoco_fleet.wait = lambda futures: (timed if phases.open else wait)(futures)  # all fleets call it, not only this one
-    try:
-        seconds = take_turns(
-            {
-                "original": lambda: original.run(steps), "ours": lockstep, "ours, overlap": overlap,
-                "raw physics": physics, "raw gradients": gradients,
-            }, rounds, before={
-                "original": share, "ours": lockstep.threads, "ours, overlap": overlap.threads,
-                "raw physics": physics.rewind,
-            },
-        )  # fmt: skip
-    finally:
-        mujoco_fleet.wait = wait  # type: ignore[attr-defined]
+    seconds = take_turns(
+        {
+            "original": lambda: original.run(steps), "ours": lockstep, "ours, overlap": overlap,
+            "raw physics": physics, "raw gradients": gradients,
+        }, rounds, before={
+            "original": share, "ours": lockstep.threads, "ours, overlap": overlap.threads, "raw physics": physics.rewind,
+        },
+    )  # fmt: skip
     original.envs.close()
     floors = ("raw physics", "raw gradients")
     return {

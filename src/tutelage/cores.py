@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import Any
 
 
 def available_cores() -> int:
@@ -19,18 +21,45 @@ def default_torch_threads() -> int:
     return min(4, available_cores())
 
 
-@cache
-def workers(threads: int | None = None) -> ThreadPoolExecutor:
-    """So many threads of this process, by default one a core, for compiled code that holds no interpreter lock.
+class Together:
+    """Pieces of work that helpers begin in the background, and that whoever waits for them takes a hand in.
 
-    Whoever asks for the same number gets the same threads: physics and learning take turns in them, so that together they
-    have no more than there are cores. What runs in one of them must not wait for another.
+    Physics and learning share the helpers: with the thread that waits, they are no more than `threads`. Pieces are to be
+    compiled code, or others that hold no interpreter lock for long, and must not wait for one another.
+
+    Args:
+        threads: how many threads compute side by side, the one that waits included. With one, all is done by `results`.
+        pieces: the pieces.
     """
-    return ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="worker")
+
+    def __init__(self, threads: int, pieces: Sequence[Callable[[], Any]]) -> None:
+        self._pieces = pieces
+        self._futures = [_helpers(threads - 1).submit(piece) for piece in pieces] if threads > 1 else []
+
+    def results(self) -> list[Any]:
+        """Do what nobody has begun, and wait for the rest; what the pieces returned. Raises what they raised."""
+        if not self._futures:
+            return [piece() for piece in self._pieces]
+        found: list[Any] = [None] * len(self._pieces)
+        begun = []
+        for k in reversed(range(len(self._pieces))):  # helpers come from the other end
+            if self._futures[k].cancel():
+                found[k] = self._pieces[k]()
+            else:
+                begun.append(k)
+        for k in begun:
+            found[k] = self._futures[k].result()
+        return found
+
+
+@cache
+def _helpers(number: int) -> ThreadPoolExecutor:
+    """So many threads of this process; the same ones for all who ask for the same number."""
+    return ThreadPoolExecutor(number, thread_name_prefix="helper")
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=workers.cache_clear)  # a forked process has none of these threads
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process has none of these threads
 
 
 @cache

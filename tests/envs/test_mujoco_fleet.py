@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tutelage.checks import check_env
-from tutelage.envs.engine import BAD_VELOCITY, wait
+from tutelage.envs.engine import BAD_VELOCITY
 from tutelage.envs.mujoco_fleet import MujocoFleet
 from tutelage.envs.tasks import MUJOCO, Walker2d
 from tutelage.errors import ConfigError, ContractError
@@ -236,12 +236,12 @@ def test_physics_that_diverges_within_a_timestep_is_noticed_there(name: str) -> 
     physics, blow = fleet.physics, np.zeros((3, 6))
     before, blow[2] = physics.raw_frame.copy(), 1e15
     ctrl = np.zeros((3, physics.model.nu))
-    wait(physics.advance_async(np.arange(3), ctrl, blow, fleet.task.frame_skip))
+    physics.advance_async(np.arange(3), ctrl, blow, fleet.task.frame_skip).results()
     assert physics.unstable.tolist() == [0, 0, BAD_VELOCITY]
     assert ((physics.raw_frame == before).all(axis=1)).tolist() == [False, False, True], "the last good frame"
     assert np.isfinite(physics.get_state()).all()
     physics.restart(np.array([2]), physics.qpos0[None], physics.qvel0[None])
-    wait(physics.advance_async(np.arange(3), ctrl, None, 1))
+    physics.advance_async(np.arange(3), ctrl, None, 1).results()
     assert not physics.unstable.any()
     fleet.close()
 

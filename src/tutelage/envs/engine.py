@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from tutelage.cores import available_cores, workers
+from tutelage.cores import Together, available_cores
 from tutelage.errors import MissingExtraError
 
 try:
@@ -157,7 +156,7 @@ class Physics:
         fields: names of float64 `mjData` arrays to bring back after each step, such as ("qpos", "qvel", "cfrc_ext").
         push_body: name or index of the body on which `advance(push=...)` acts.
         contact_forces: also compute `cfrc_ext` after each step (`mj_rnePostConstraint`).
-        threads: worker threads; default: one per core this process may use. See `workers`.
+        threads: threads that step robots, see `Together`; default: one per core this process may use.
 
     `frame[name]` is the field of all robots, shape (N, *field shape), a view that the next step overwrites.
 
@@ -186,7 +185,6 @@ class Physics:
         self.unstable = np.zeros(num_robots, dtype=np.int8)
         self._forces = contact_forces
         self._push_body = self.model.body(push_body).id
-        self._pool = workers(threads or available_cores())
 
         shapes = {name: getattr(self.datas[0], name).shape for name in fields}
         self._sizes = np.array([int(np.prod(s)) for s in shapes.values()], dtype=np.intp)
@@ -231,8 +229,8 @@ class Physics:
             self.models.append(model)
         self._point()
 
-    def advance_async(self, robots: Array, ctrl: Array, push: Array | None, substeps: int) -> list[Future[None]]:
-        """Start `substeps` physics steps of the given robots (indices) in the background; `wait` for the result.
+    def advance_async(self, robots: Array, ctrl: Array, push: Array | None, substeps: int) -> Together:
+        """Start `substeps` physics steps of the given robots (indices) in the background; ask for its `results`.
 
         ctrl: (N, nu) actuator commands; push: (N, 6) force (N) and torque (N m) on the push body, or None.
         """
@@ -249,13 +247,12 @@ class Physics:
     def restart(self, robots: Array, qpos: Array, qvel: Array) -> None:
         """Put the given robots (n indices) at qpos (n, nq) and qvel (n, nv), everything else at its initial value."""
         self._qpos[robots], self._qvel[robots] = qpos, qvel
-        futures = self._spread(
+        self._spread(
             _restart, robots,
             self._models_at, self._datas_at, self.unstable,
             self._qpos_at, _address(self._qpos), self.model.nq, self._qvel_at, _address(self._qvel), self.model.nv,
             self._sources, self._sizes, _address(self._frame), self._width,
-        )  # fmt: skip
-        wait(futures)
+        ).results()  # fmt: skip
 
     def place(self, robots: Array, qpos: Array) -> None:
         """Move the given robots (n indices) to qpos (n, nq) in the middle of what they do: all else goes on."""
@@ -264,7 +261,7 @@ class Physics:
         if "qpos" in self.frame:
             self.frame["qpos"][robots] = qpos
 
-    def _spread(self, kernel: Any, robots: Array, *arguments: Any) -> list[Future[None]]:
+    def _spread(self, kernel: Any, robots: Array, *arguments: Any) -> Together:
         robots = np.ascontiguousarray(robots, dtype=np.intp)
         # The threads claim robots one by one from a common counter, in compiled code: falls and contacts take longer, and
         # none of them waits for the interpreter lock while training holds it.
@@ -273,7 +270,7 @@ class Physics:
         def work() -> None:
             kernel(robots, _address(counter), *arguments)
 
-        return [self._pool.submit(work) for _ in range(min(self.threads, len(robots)))]
+        return Together(self.threads, [work] * min(self.threads, len(robots)))
 
     def get_state(self) -> Array:
         """Full integration state of every robot, (N, S) float64: what is needed to continue bit for bit."""
@@ -295,9 +292,3 @@ class Physics:
     def raw_frame(self) -> Array:
         """All fields of all robots, (N, width) float64, in one array."""
         return self._frame
-
-
-def wait(futures: list[Future[None]]) -> None:
-    """Wait for background work and raise what it raised."""
-    for future in futures:
-        future.result()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.envs.disturbance import Disturbance, Pusher
-from tutelage.envs.engine import BAD_POSITION, BAD_VELOCITY, STABLE, Physics, wait
+from tutelage.envs.engine import BAD_POSITION, BAD_VELOCITY, STABLE, Physics
 from tutelage.envs.task_fleet import PIXELS, Result, TaskFleet
 from tutelage.envs.tasks.base import Array, GoalTask, MujocoTask
 from tutelage.errors import ConfigError
@@ -69,7 +69,7 @@ class MujocoFleet(TaskFleet):
         self._body_mass = np.tile(model.body_mass, (num_envs, 1))
         self._position = np.zeros(num_envs)
         self._renderers: dict[tuple[int, int], Any] = {}
-        self._futures: Any = None
+        self._moves: Any = None
 
         low, high = model.actuator_ctrlrange.astype(np.float32).T
         if task.action_low is not None and task.action_high is not None:
@@ -98,10 +98,10 @@ class MujocoFleet(TaskFleet):
             actions = np.where(moving[:, None], np.clip(noisy, self.action_low, self.action_high), 0.0)
         ctrl = self.task.control(self.physics.frame, actions)
         push = self._pusher.step(self._rng, moving) if self.disturbance.push else None
-        self._futures = self.physics.advance_async(np.flatnonzero(moving), ctrl, push, self.task.frame_skip)
+        self._moves = self.physics.advance_async(np.flatnonzero(moving), ctrl, push, self.task.frame_skip)
 
     def _finish(self, actions: Array, moving: Mask) -> Result:
-        wait(self._futures)
+        self._moves.results()
         frame, obs = self.physics.frame, self._observe()
         unstable = np.where(moving, self.physics.unstable, STABLE)
         unstable[moving & (unstable == STABLE) & ~np.isfinite(obs).all(axis=1)] = BAD_OBSERVATION

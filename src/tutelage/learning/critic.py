@@ -137,7 +137,7 @@ class Critic:
         config: hyper-parameters.
         scale: (obs_mean, obs_std, action_middle, action_half), to normalise inputs.
         rng: the seeded stream of batches; seed: of the initial weights.
-        threads: see `workers`; default: one a core. Networks that see vectors are asked, and learn, in them.
+        threads: see `Together`; default: one a core. Networks that see vectors are asked, and learn, in them.
     """
 
     def __init__(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tutelage.cores import one_thread_a_product, workers
+from tutelage.cores import Together, one_thread_a_product
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.mlp import Arrays, BatchedMLP
 from tutelage.policies.networks import Network
@@ -55,19 +55,19 @@ class CompiledDescent:
     Args:
         net: the networks. Their weights stay where they are: what loads others into `net` changes what is learned from.
         learning_rate: of Adam.
-        threads: see `workers`.
+        threads: see `Together`.
     """
 
     def __init__(self, net: BatchedMLP, learning_rate: float, threads: int) -> None:
         one_thread_a_product()
-        self._pool, self._learning_rate, self._steps = workers(threads), learning_rate, 0
+        self._threads, self._learning_rate, self._steps = threads, learning_rate, 0
         self._weights, self._biases = net.arrays()
         self._members = len(self._weights[0])
         size = sum(weight[0].size + bias[0].size for weight, bias in zip(self._weights, self._biases, strict=True))
         self._gradient, self._first, self._second = (np.zeros((self._members, size), np.float32) for _ in range(3))
         self._values: Arrays = ()
         self._deltas: Arrays = ()
-        self._futures: list[Future[float]] = []
+        self._begun = Together(1, [])
 
     def begin(self, kernel: Callable[..., float], batch: int, *data: Any) -> None:
         """Start a step of every network in the background.
@@ -81,11 +81,12 @@ class CompiledDescent:
         correction = np.float32(1 / np.sqrt(1 - 0.999**self._steps))
         layers = self._weights, self._biases, self._values, self._deltas
         adam = self._gradient, self._first, self._second, rate, correction
-        self._futures = [self._pool.submit(kernel, k, *data, *layers, *adam) for k in range(self._members)]
+        pieces = [partial(kernel, k, *data, *layers, *adam) for k in range(self._members)]
+        self._begun = Together(self._threads, pieces)
 
     def end(self) -> float:
         """Wait for what began; returns the mean of the losses before it."""
-        return sum(future.result() for future in self._futures) / self._members
+        return float(sum(self._begun.results())) / self._members
 
     def _rooms(self, batch: int) -> tuple[Arrays, Arrays]:
         """Room for what the layers say of a batch, and for its gradients."""

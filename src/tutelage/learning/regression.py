@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
+from functools import partial
 from typing import Any, Protocol
 
 import torch
 
-from tutelage.cores import workers
+from tutelage.cores import Together
 from tutelage.learning.dataset import AggregatedDataset
 from tutelage.learning.descent import CompiledDescent, Descent
 from tutelage.policies.ensemble import EnsemblePolicy
@@ -73,16 +73,16 @@ class BatchedRegression:
     """All members learn together, as batched products of PyTorch, in one background task. Arguments: see `regression`."""
 
     def __init__(self, policy: EnsemblePolicy, learning_rate: float) -> None:
-        self._policy, self._pool = policy, workers(policy.threads)
+        self._policy, self._begun = policy, Together(1, [])
         self._descent = Descent(policy.net, learning_rate)
-        self._future: Future[float] | None = None
 
     def begin(self, data: AggregatedDataset, batch: int) -> None:
-        self._future = self._pool.submit(self._step, *data.batches(batch), torch.get_num_threads())
+        step = partial(self._step, *data.batches(batch), torch.get_num_threads())
+        self._begun = Together(self._policy.threads, [step])
 
     def end(self) -> float:
-        assert self._future is not None
-        return self._future.result()
+        (loss,) = self._begun.results()
+        return float(loss)
 
     def _step(self, obs: torch.Tensor, actions: torch.Tensor, threads: int) -> float:
         torch.set_num_threads(threads)  # each thread has a number of its own

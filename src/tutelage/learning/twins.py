@@ -46,7 +46,7 @@ def twins(
         largest: whether it is the larger of two that counts.
         learning_rate: of Adam.
         tau: how far Q' goes towards Q in a step.
-        threads: see `workers`.
+        threads: see `Together`.
     """
     if isinstance(net, BatchedMLP) and isinstance(target, BatchedMLP):
         return CompiledTwins(net, target, scale, largest, learning_rate, tau, threads)

@@ -1,19 +1,20 @@
 """Multilayer perceptrons as compiled code: what ensembles and critics say of many robots at once.
 
-Nothing here holds the interpreter lock, so parts of a fleet are asked side by side, in the threads of `workers`. A part has
+Nothing here holds the interpreter lock, so parts of a fleet are asked side by side, in the threads of physics. A part has
 the same robots whatever the number of threads, and its numbers come from one thread in one order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.cores import one_thread_a_product, workers
+from tutelage.cores import Together, one_thread_a_product
 
 Array = NDArray[Any]
 
@@ -125,10 +126,4 @@ def ask_all(kernel: Callable[..., None], networks: int, robots: int, threads: in
     """kernel(k, start, stop, *arguments) for each network k and all robots, part by part, side by side where it pays."""
     one_thread_a_product()
     parts = [(k, at, min(at + PART, robots)) for k in range(networks) for at in range(0, robots, PART)]
-    if threads == 1 or robots < FEW:
-        for part in parts:
-            kernel(*part, *arguments)
-        return
-    pool = workers(threads)
-    for future in [pool.submit(kernel, *part, *arguments) for part in parts]:
-        future.result()
+    Together(1 if robots < FEW else threads, [partial(kernel, *part, *arguments) for part in parts]).results()

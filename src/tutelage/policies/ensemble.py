@@ -28,7 +28,7 @@ class EnsemblePolicy(nn.Module):
         members: K.
         hidden: widths of the (fully connected) hidden layers; default: 256 and 256, for images 100, 50 and 10.
         seed: of the initial weights.
-        threads: see `workers`; default: one a core. Networks that see vectors are asked, and learn, in them.
+        threads: see `Together`; default: one a core. Networks that see vectors are asked, and learn, in them.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class EnsemblePolicy(nn.Module):
         self._seen: Array | None = None
         self._said: tuple[Array, Array] = np.empty(0), np.empty(0)
         if isinstance(self.net, BatchedMLP):  # what is compiled on first use is compiled now, not while robots wait
-            self.act(np.zeros((1, *self.obs_shape), np.float32))
+            self._ask(np.zeros((1, *self.obs_shape), np.float32))
             self.forget()
 
     def _network(self, seed: int) -> Network:

@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from tyro.conf import Positional
 
-from tutelage.envs.engine import Physics, wait
+from tutelage.envs.engine import Physics
 from tutelage.envs.experts.allegro_hand import BASIS, CYCLE, FEATURES, FILE, HARMONICS, SIDES, Gait, features, follow
 from tutelage.envs.tasks.allegro_hand import APART, DROPPED, HOME, RANGE, REST, TOLERANCE, AllegroHand
 from tutelage.envs.tasks.base import Array
@@ -110,7 +110,7 @@ class Trial:
             actions = follow(periods[everyone, at], feedback[everyone, at], heeded, previous)
             previous = (actions + noise * np.tile(rng.standard_normal((self.starts, 16)), (self.candidates, 1))).clip(-1, 1)
             command = self.task.control(frame, previous)
-            wait(physics.advance_async(np.flatnonzero(going), command, None, self.task.frame_skip))
+            physics.advance_async(np.flatnonzero(going), command, None, self.task.frame_skip).results()
             before, (yaw, upright) = yaw, _yaw_and_lean(frame["qpos"])
             turn = (yaw - before + np.pi) % (2 * np.pi) - np.pi
             away = np.linalg.norm(frame["qpos"][:, CUBE] - REST, axis=1)
