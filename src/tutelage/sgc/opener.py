@@ -34,6 +34,7 @@ from tutelage.sgc.packet import (
     Buffer,
     Opened,
     Statements,
+    make_opened,
     message_key,
     nonce,
     read_header,
@@ -172,14 +173,14 @@ class Opener:
             member = self._session_member(stream, raw, packet, end, now)
         else:
             member = self._member(stream, raw, packet[HEADER:start], now)
-        epoch, salt, authentic, began = stream.epoch, stream.salt, self._authentic, stream.start
+        node, epoch, salt, authentic, began = member.node, stream.epoch, stream.salt, self._authentic, stream.start
         if flags & BATCH:
             messages = [
-                Opened(part, member.node, sequence, salt, sent, epoch, authentic, began)
+                make_opened((part, node, sequence, salt, sent, epoch, authentic, began))
                 for sequence, part in enumerate(split_batch(body), first)
             ]
         else:
-            messages = [Opened(body, member.node, first, salt, sent, epoch, authentic, began)]
+            messages = [make_opened((body, node, first, salt, sent, epoch, authentic, began))]
         if self._mode == CHAIN:
             return self._chained(stream, flags, raw, bind, body, packet[end:], member, messages, now)
         if self._mode == SIGNATURE:

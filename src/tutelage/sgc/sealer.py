@@ -119,17 +119,18 @@ class Sealer:
             NotAllowed: the policy has changed.
             ConfigError: the payload is too long.
         """
-        return self._seal(_flat(payload), 0, 1, bind, now)
+        return self._seal(_flat(payload) if isinstance(payload, memoryview) else payload, 0, 1, bind, now)
 
-    def seal_many(self, payloads: Sequence[Buffer], *, now: int | None = None) -> Packet:
+    def seal_many(self, payloads: Sequence[Buffer], *, head: bytes = b"", now: int | None = None) -> Packet:
         """Many small messages as one packet with one proof. `Opener.open_many` gives them back one by one.
+
+        head: what each message begins with, not yet in `payloads`.
 
         Raises:
             As `seal`.
         """
-        return self._seal(
-            join_batch([p if isinstance(p, bytes) else _flat(p) for p in payloads]), BATCH, len(payloads), b"", now
-        )
+        parts = [_flat(each) if isinstance(each, memoryview) else each for each in payloads]
+        return self._seal(join_batch(parts, head), BATCH, len(parts), b"", now)
 
     def introduce(self) -> None:
         """Let the next packet carry this node's credential, as a receiver said that it does not know us."""
@@ -257,10 +258,8 @@ class Sealer:
         return now < session.until and self._entry.rule.may_receive(session.member.node, self.lane)
 
 
-def _flat(payload: Buffer) -> Buffer:
+def _flat(payload: memoryview) -> memoryview:
     """As bytes one after the other."""
-    if not isinstance(payload, memoryview):
-        return payload
     try:
         return payload.cast("B")
     except TypeError:
