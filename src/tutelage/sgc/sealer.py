@@ -181,14 +181,17 @@ class Sealer:
             cipher = self._look(now)
             first = self.sequence + 1
             self.sequence += count
-            introduction = b""
-            if self._mode != SESSION and not 0 < self._introduce_at - now <= self._introduce_every:
-                introduction = self._home.credential
-                self._introduce_at = now + self._introduce_every
-            if self._mode == CHAIN and self._link.due(now):
-                flags |= ANCHOR
-            introduced = len(introduction) + TAG if introduction else 0
-            proof = self._proof_bytes(flags)
+            introduction, introduced = b"", 0
+            if self._mode == SESSION:
+                proof = SLOT * len(self._sessions)
+            else:
+                if not 0 < self._introduce_at - now <= self._introduce_every:
+                    introduction = self._home.credential
+                    introduced = len(introduction) + TAG
+                    self._introduce_at = now + self._introduce_every
+                if self._mode == CHAIN and self._link.due(now):
+                    flags |= ANCHOR
+                proof = self._proof_bytes(flags)
             header = self._header(flags, first, introduced, proof, now)
             if not introduced and len(body) <= _SMALL:
                 sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind)
@@ -206,8 +209,6 @@ class Sealer:
             return packet
 
     def _proof_bytes(self, flags: int) -> int:
-        if self._mode == SESSION:
-            return SLOT * len(self._sessions)
         if self._mode == SIGNATURE:
             return _SIGNATURE + TAG
         return self._link.proof_bytes(with_message=True) + TAG if flags & ANCHOR else 0

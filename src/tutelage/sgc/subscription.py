@@ -193,7 +193,8 @@ class Subscription:
             return
         if self._direct and self._inbox.empty() and not self.delivery.crowded and self._turn.acquire(blocking=False):
             try:
-                self.outlet.give(self._take(time.time(), packet))
+                now = time.time_ns()
+                self.outlet.give(self._take(now * 1e-9, packet, now))
             except Exception:
                 log.exception("subscription of %s", self.alias)
             finally:
@@ -286,10 +287,10 @@ class Subscription:
             for received, packet in held:
                 self.outlet.give(self._take(received, packet))
 
-    def _take(self, received: float, packet: bytes | memoryview) -> list[Message]:
-        """Open a packet; the messages that it completes."""
+    def _take(self, received: float, packet: bytes | memoryview, now: int | None = None) -> list[Message]:
+        """Open a packet; the messages that it completes. received: seconds since 1970; now: nanoseconds, None: the clock."""
         try:
-            opened = self.opener.open_many(packet)
+            opened = self.opener.open_many(packet, now=now)
         except Refused as refused:
             self._refused(refused.reason, received, packet)
             return []
