@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tutelage.sgc import frames
-from tutelage.sgc.messages import Message
+from tutelage.sgc.messages import Message, make_message
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.sealing import Opened
 
@@ -33,7 +33,7 @@ class Assembler:
                 self._refusals.add(refused.reason)
                 continue
             if payload is not None:
-                messages.append(Message(payload, sender, alias, sequence, sent * 1e-9, received, authentic))
+                messages.append(make_message((payload, sender, alias, sequence, sent * 1e-9, received, authentic)))
         return messages
 
     def _begin(self, salt: bytes) -> frames.Assembly:

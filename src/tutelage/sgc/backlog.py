@@ -31,10 +31,13 @@ class Backlog:
         """Is there room for a message of so many bytes?"""
         return not self._queue or (len(self._queue) < QUEUE_MESSAGES and self._bytes + size <= QUEUE_BYTES)
 
-    def add(self, payload: bytes, sent: int) -> None:
-        """Another message. sent: nanoseconds since 1970."""
+    def add(self, payload: bytes, sent: int) -> int:
+        """Another message, if there is room; how many wait then, 0: no room. sent: nanoseconds since 1970."""
+        if not self.room(len(payload)):
+            return 0
         self._queue.append((payload, sent))
         self._bytes += len(payload)
+        return len(self._queue)
 
     def take(self) -> Batch:
         """What goes out next: small messages together, a large one alone. There must be some."""

@@ -7,6 +7,7 @@ that a lost packet costs one piece. The age of the stream tells a receiver wheth
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -59,14 +60,13 @@ def head(kind: Kind, age: float) -> bytes:
     return _HEAD.pack(kind, min(int(age * 1000), _LONGEST_AGE))
 
 
-def pieces(payload: memoryview, age: float) -> list[bytes]:
-    """The frames of a message that is larger than `PIECE`."""
+def pieces(payload: memoryview, age: float) -> Iterator[bytes]:
+    """The frames of a message that is larger than `PIECE`, each made when it is asked for: the first is soon on its way."""
     count = -(-len(payload) // PIECE)
     milliseconds = min(int(age * 1000), _LONGEST_AGE)
-    return [
-        b"".join((_PIECE.pack(Kind.PIECE, milliseconds, index, len(payload)), payload[index * PIECE : (index + 1) * PIECE]))
-        for index in range(count)
-    ]
+    for index in range(count):
+        head = _PIECE.pack(Kind.PIECE, milliseconds, index, len(payload))
+        yield b"".join((head, payload[index * PIECE : (index + 1) * PIECE]))
 
 
 def age_of(payload: bytes | memoryview) -> float:

@@ -34,6 +34,7 @@ from tutelage.sgc.packet import (
     Buffer,
     Opened,
     Statements,
+    make_opened,
     message_key,
     nonce,
     read_header,
@@ -49,6 +50,7 @@ from tutelage.sgc.trust import Member
 
 _LOOK_EVERY = 250_000_000  # nanoseconds between looks at keys and policy
 _NEVER = -1
+_SMALL = 4096  # bytes of a packet up to which copies of its parts cost less than views of them
 _MAX_STREAMS = 1024
 _MAX_SESSIONS = 1024
 
@@ -117,7 +119,7 @@ class Opener:
             Refused: see `Reason`. Counted.
         """
         try:
-            return self._open(memoryview(packet), bind, time.time_ns() if now is None else now)
+            return self._open(packet, bind, time.time_ns() if now is None else now)
         except Refused as refused:
             self.refusals.add(refused.reason)
             raise
@@ -144,8 +146,10 @@ class Opener:
                 self._sessions.popitem(last=False)
             return session.member.node
 
-    def _open(self, packet: memoryview, bind: bytes, now: int) -> list[Opened]:
+    def _open(self, packet: Buffer, bind: bytes, now: int) -> list[Opened]:
         size = len(packet)
+        if size > _SMALL or not isinstance(packet, bytes):
+            packet = memoryview(packet)
         if size > MAX_PACKET:
             raise Refused(Reason.OVERSIZE, f"a packet of {size} bytes; {MAX_PACKET} are allowed")
         if size < HEADER + TAG:
@@ -172,14 +176,14 @@ class Opener:
             member = self._session_member(stream, raw, packet, end, now)
         else:
             member = self._member(stream, raw, packet[HEADER:start], now)
-        epoch, salt, authentic, began = stream.epoch, stream.salt, self._authentic, stream.start
+        node, epoch, salt, authentic, began = member.node, stream.epoch, stream.salt, self._authentic, stream.start
         if flags & BATCH:
             messages = [
-                Opened(part, member.node, sequence, salt, sent, epoch, authentic, began)
+                make_opened((part, node, sequence, salt, sent, epoch, authentic, began))
                 for sequence, part in enumerate(split_batch(body), first)
             ]
         else:
-            messages = [Opened(body, member.node, first, salt, sent, epoch, authentic, began)]
+            messages = [make_opened((body, node, first, salt, sent, epoch, authentic, began))]
         if self._mode == CHAIN:
             return self._chained(stream, flags, raw, bind, body, packet[end:], member, messages, now)
         if self._mode == SIGNATURE:
@@ -200,7 +204,7 @@ class Opener:
         raw: bytes,
         bind: bytes,
         body: bytes,
-        proof: memoryview,
+        proof: Buffer,
         member: Member,
         messages: list[Opened],
         now: int,
@@ -216,9 +220,7 @@ class Opener:
             return (ready or []) + self._anchor(stream, PROOF, raw, proof, member, now)
         return ready or []
 
-    def _anchor(
-        self, stream: _Stream, purpose: bytes, raw: bytes, proof: memoryview, member: Member, now: int
-    ) -> list[Opened]:
+    def _anchor(self, stream: _Stream, purpose: bytes, raw: bytes, proof: Buffer, member: Member, now: int) -> list[Opened]:
         anchor = _decrypt(stream.cipher, purpose, proof, raw)
 
         def admit(first: int, messages: list[Opened]) -> None:
@@ -255,7 +257,7 @@ class Opener:
                 while len(self._members) > MAX_SENDERS:
                     self._members.popitem(last=False)
 
-    def _member(self, stream: _Stream, raw: bytes, introduction: memoryview, now: int) -> Member:
+    def _member(self, stream: _Stream, raw: bytes, introduction: Buffer, now: int) -> Member:
         """Who the sender is, from its introduction or an earlier one; it may send, now."""
         if introduction:
             member = self._home.trust.read(_decrypt(stream.cipher, INTRODUCTION, introduction, raw))
@@ -271,7 +273,7 @@ class Opener:
         self._check(member, now)
         return member
 
-    def _session_member(self, stream: _Stream, raw: bytes, packet: memoryview, end: int, now: int) -> Member:
+    def _session_member(self, stream: _Stream, raw: bytes, packet: Buffer, end: int, now: int) -> Member:
         """Who the sender is, from the tag that it made for us."""
         for at in range(end, len(packet), SLOT):
             session = self._sessions.get(stream.start + packet[at : at + SESSION_ID])
@@ -328,7 +330,7 @@ class _Stream:
         self.member: Member | None = None
 
 
-def _decrypt(cipher: AESGCM, purpose: bytes, sealed: memoryview, associated: bytes) -> bytes:
+def _decrypt(cipher: AESGCM, purpose: bytes, sealed: Buffer, associated: bytes) -> bytes:
     try:
         return cipher.decrypt(nonce(purpose, associated), sealed, associated)
     except InvalidTag:

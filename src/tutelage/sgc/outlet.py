@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue as queues
-import threading
 from collections.abc import Callable
 
 from tutelage.sgc.messages import Message
@@ -23,7 +22,7 @@ class Outlet:
         received, bytes: messages given, and what they hold.
         superseded: messages of a lossy topic that newer ones replaced.
         failed: exceptions of the callback.
-        closed: set when no more is to be given.
+        closed: True when no more is to be given.
     """
 
     def __init__(self, alias: str, on_message: Callable[[Message], None] | None, limit: int, *, lossy: bool) -> None:
@@ -33,7 +32,7 @@ class Outlet:
             limit: messages in the queue; beyond, a reliable topic waits, and a lossy one drops the oldest.
         """
         self.received = self.bytes = self.superseded = self.failed = 0
-        self.closed = threading.Event()
+        self.closed = False
         self._alias, self._lossy = alias, lossy
         self._call = self._put if on_message is None else on_message
         self._queue: queues.Queue[Message | None] = queues.Queue(limit)
@@ -73,7 +72,7 @@ class Outlet:
         return self._queue.qsize()
 
     def _put(self, message: Message) -> None:
-        while not self.closed.is_set():
+        while not self.closed:
             try:
                 self._queue.put(message, block=not self._lossy, timeout=LOOK)
                 return

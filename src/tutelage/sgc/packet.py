@@ -14,9 +14,9 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -147,16 +147,19 @@ def digest(body: Buffer) -> bytes:
     return b"\1" + hashlib.sha256(b"".join(parts)).digest()
 
 
-def join_batch(payloads: Sequence[Buffer]) -> bytes:
+def join_batch(payloads: Sequence[Buffer], head: bytes = b"") -> bytes:
     """The body of a batch: count, lengths, payloads.
+
+    head: what each payload begins with, not yet in it.
 
     Raises:
         ConfigError: none, or too many.
     """
     if not 0 < len(payloads) <= MAX_BATCH:
         raise ConfigError(f"a batch has 1 to {MAX_BATCH} messages, not {len(payloads)}")
-    lengths = struct.pack(f">{len(payloads)}I", *map(len, payloads))
-    return b"".join((_COUNT.pack(len(payloads)), lengths, *payloads))
+    begun = len(head)
+    lengths = struct.pack(f">{len(payloads)}I", *[begun + len(payload) for payload in payloads])
+    return b"".join((_COUNT.pack(len(payloads)), lengths, head, head.join(payloads)))
 
 
 def split_batch(body: bytes) -> list[bytes]:
@@ -205,6 +208,9 @@ class Opened(NamedTuple):
         """40 bytes that identify the message: sender, salt and sequence; a reply binds to its request's."""
         return self.stream + self.sequence.to_bytes(8, "big")
 
+
+make_opened: Callable[[tuple[bytes, str, int, bytes, int, int, bool, bytes]], Opened] = partial(tuple.__new__, Opened)
+"""`Opened` of all its fields, in two thirds of the time that its own constructor takes."""
 
 _threads: ThreadPoolExecutor | None = None
 

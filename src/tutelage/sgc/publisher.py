@@ -114,7 +114,7 @@ class Publisher:
         with self._lock:
             if self._closing or self._failure is not None:
                 self._check()
-            alone = size <= INLINE and not self._queue and not self._busy and now >= self._free_at
+            alone = now >= self._free_at and not self._busy and size <= INLINE and not self._queue
             if alone:
                 self._busy = True
             else:
@@ -171,10 +171,11 @@ class Publisher:
     def _enqueue(self, payload: bytes, sent: int, wait: float) -> None:
         if self._lossy:
             self.superseded += self._queue.drop()
-        if not self._queue.room(len(payload)):
+        waiting = self._queue.add(payload, sent)
+        if not waiting:
             self._wait_for_room(len(payload), wait)
-        self._queue.add(payload, sent)
-        if len(self._queue) == 1:  # else the worker knows that there is something to send
+            waiting = self._queue.add(payload, sent)
+        if waiting == 1:  # else the worker knows that there is something to send
             self._changed.notify_all()
 
     def _wait_for_room(self, size: int, timeout: float) -> None:
@@ -200,16 +201,17 @@ class Publisher:
         """Seal and send; without a key, back into the queue."""
         try:
             payload, sent = batch[0]
-            size = len(payload)
+            size, age, seal = len(payload), now - self._born, self._sealer.seal
             if len(batch) > 1:
-                head = frames.head(_WHOLE, now - self._born)
-                self._publish([head + payload for payload, _ in batch], sent, now)
-                size = sum([len(payload) for payload, _ in batch])
+                payloads = [payload for payload, _ in batch]
+                packet = self._sealer.seal_many(payloads, head=frames.head(_WHOLE, age), now=sent)
+                self._hand_over(len(batch), packet, now)
+                size = sum(map(len, payloads))
             elif size <= frames.PIECE:
-                self._publish([frames.head(_WHOLE, now - self._born) + payload], sent, now)
+                self._hand_over(1, seal(frames.head(_WHOLE, age) + payload, now=sent), now)
             else:
-                for piece in frames.pieces(memoryview(payload), now - self._born):
-                    self._publish([piece], sent, now)
+                for piece in frames.pieces(memoryview(payload), age):
+                    self._hand_over(1, seal(piece, now=sent), now)
             self.sent += len(batch)
             self.bytes += size
         except NoKey:
@@ -234,12 +236,6 @@ class Publisher:
             wakes_at = self._wakes_at
             if self._queue or self._waiting or self._life_at < wakes_at or self._anchor_at < wakes_at:
                 self._changed.notify_all()
-
-    def _publish(self, payloads: list[bytes], sent: int, now: float) -> None:
-        if len(payloads) == 1:
-            self._hand_over(1, self._sealer.seal(payloads[0], now=sent), now)
-        else:
-            self._hand_over(len(payloads), self._sealer.seal_many(payloads, now=sent), now)
 
     def _hand_over(self, count: int, packet: bytes | bytearray, now: float) -> None:
         """To the network, and into the history, which nobody can ask for it before it or a later one has gone out."""
@@ -296,7 +292,7 @@ class Publisher:
     def _show_life(self) -> None:
         try:
             now = time.monotonic()
-            self._publish([frames.head(frames.Kind.LIFE, now - self._born)], time.time_ns(), now)
+            self._hand_over(1, self._sealer.seal(frames.head(frames.Kind.LIFE, now - self._born)), now)
         except NoKey:
             self._need_key()
         finally:

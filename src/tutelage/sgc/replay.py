@@ -19,6 +19,8 @@ MAX_SENDERS = 1024
 TOLERANCE_NS = 5_000_000_000
 """By how much clocks of sender and receiver may differ: 5 seconds."""
 _BLOCK = 1024
+_ENDLESS = 1 << 64
+"""Nanoseconds; no time in a header is so long ago."""
 
 
 class Window:
@@ -91,7 +93,7 @@ class Replay:
 
     def set_max_age(self, max_age: float | None) -> None:
         """The policy may change it. Seconds."""
-        self._max_age = None if max_age is None else round(max_age * 1e9)
+        self._max_age = _ENDLESS if max_age is None else round(max_age * 1e9)
 
     def check(self, sender: bytes, salt: bytes, first: int, sent: int, now: int) -> None:
         """Could a message be taken, as far as its header says? Remembers nothing, so it may be asked before the message is
@@ -100,7 +102,8 @@ class Replay:
         Raises:
             Refused: TOO_OLD, FUTURE, REPLAYED or STALE.
         """
-        self.check_time(sent, now)
+        if not now - self._max_age <= sent <= now + TOLERANCE_NS:
+            self.check_time(sent, now)
         known = self._senders.get(sender)
         window = known.windows.get(salt) if known is not None else None
         if window is None or first <= window.highest:  # else it is new, as nearly all are
@@ -138,7 +141,7 @@ class Replay:
         if sent > now + TOLERANCE_NS:
             ahead = (sent - now) / 1e9
             raise Refused(Reason.FUTURE, f"sent {ahead:.1f} s in the future: the sender's clock is ahead, or ours is late")
-        if self._max_age is not None and now - sent > self._max_age:
+        if now - sent > self._max_age:
             age, limit = (now - sent) / 1e9, self._max_age / 1e9
             raise Refused(Reason.TOO_OLD, f"sent {age:.2f} s ago, and the topic's maximum age is {limit:g} s")
 

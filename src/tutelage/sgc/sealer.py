@@ -119,17 +119,18 @@ class Sealer:
             NotAllowed: the policy has changed.
             ConfigError: the payload is too long.
         """
-        return self._seal(_flat(payload), 0, 1, bind, now)
+        return self._seal(_flat(payload) if isinstance(payload, memoryview) else payload, 0, 1, bind, now)
 
-    def seal_many(self, payloads: Sequence[Buffer], *, now: int | None = None) -> Packet:
+    def seal_many(self, payloads: Sequence[Buffer], *, head: bytes = b"", now: int | None = None) -> Packet:
         """Many small messages as one packet with one proof. `Opener.open_many` gives them back one by one.
+
+        head: what each message begins with, not yet in `payloads`.
 
         Raises:
             As `seal`.
         """
-        return self._seal(
-            join_batch([p if isinstance(p, bytes) else _flat(p) for p in payloads]), BATCH, len(payloads), b"", now
-        )
+        parts = [_flat(each) if isinstance(each, memoryview) else each for each in payloads]
+        return self._seal(join_batch(parts, head), BATCH, len(parts), b"", now)
 
     def introduce(self) -> None:
         """Let the next packet carry this node's credential, as a receiver said that it does not know us."""
@@ -180,14 +181,17 @@ class Sealer:
             cipher = self._look(now)
             first = self.sequence + 1
             self.sequence += count
-            introduction = b""
-            if self._mode != SESSION and not 0 < self._introduce_at - now <= self._introduce_every:
-                introduction = self._home.credential
-                self._introduce_at = now + self._introduce_every
-            if self._mode == CHAIN and self._link.due(now):
-                flags |= ANCHOR
-            introduced = len(introduction) + TAG if introduction else 0
-            proof = self._proof_bytes(flags)
+            introduction, introduced = b"", 0
+            if self._mode == SESSION:
+                proof = SLOT * len(self._sessions)
+            else:
+                if not 0 < self._introduce_at - now <= self._introduce_every:
+                    introduction = self._home.credential
+                    introduced = len(introduction) + TAG
+                    self._introduce_at = now + self._introduce_every
+                if self._mode == CHAIN and self._link.due(now):
+                    flags |= ANCHOR
+                proof = self._proof_bytes(flags)
             header = self._header(flags, first, introduced, proof, now)
             if not introduced and len(body) <= _SMALL:
                 sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind)
@@ -205,8 +209,6 @@ class Sealer:
             return packet
 
     def _proof_bytes(self, flags: int) -> int:
-        if self._mode == SESSION:
-            return SLOT * len(self._sessions)
         if self._mode == SIGNATURE:
             return _SIGNATURE + TAG
         return self._link.proof_bytes(with_message=True) + TAG if flags & ANCHOR else 0
@@ -257,10 +259,8 @@ class Sealer:
         return now < session.until and self._entry.rule.may_receive(session.member.node, self.lane)
 
 
-def _flat(payload: Buffer) -> Buffer:
+def _flat(payload: memoryview) -> memoryview:
     """As bytes one after the other."""
-    if not isinstance(payload, memoryview):
-        return payload
     try:
         return payload.cast("B")
     except TypeError:

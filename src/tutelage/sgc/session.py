@@ -49,12 +49,8 @@ class Session:
     until: int
     cipher: AESGCM
 
-    def tag(self, header: bytes, sealed: Buffer) -> bytes:
-        """16 bytes over header and ciphertext, which are both in `sealed`."""
-        return self.cipher.encrypt(nonce(SESSION_TAG, header), b"", sealed)
-
     def check(self, header: bytes, sealed: Buffer, tag: Buffer) -> None:
-        """Was the tag made by the other end?
+        """Was the tag made by the other end? It is over header and ciphertext, which are both in `sealed`.
 
         Raises:
             Refused: FORGED.
@@ -159,5 +155,6 @@ class Handshake:
 
 
 def tags(sessions: list[Session], header: bytes, sealed: Buffer) -> bytes:
-    """The proof of a packet: id and tag of every session."""
-    return b"".join([session.ident + session.tag(header, sealed) for session in sessions])
+    """The proof of a packet: id and tag of every session, made over header and ciphertext, which are both in `sealed`."""
+    once = nonce(SESSION_TAG, header)
+    return b"".join([session.ident + session.cipher.encrypt(once, b"", sealed) for session in sessions])

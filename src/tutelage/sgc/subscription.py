@@ -6,7 +6,6 @@ packets unopened and fetches them again when the application has caught up; a lo
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import queue as queues
 import threading
@@ -147,9 +146,9 @@ class Subscription:
 
     def close(self) -> None:
         """Stop; a callback that runs ends first."""
-        if self.outlet.closed.is_set():
+        if self.outlet.closed:
             return
-        self.outlet.closed.set()
+        self.outlet.closed = True
         for handle in self._handles:
             handle.close()
         self._inbox.put(None)
@@ -166,7 +165,7 @@ class Subscription:
     @property
     def closed(self) -> bool:
         """Has it been closed?"""
-        return self.outlet.closed.is_set()
+        return self.outlet.closed
 
     @property
     def lost(self) -> int:
@@ -190,11 +189,12 @@ class Subscription:
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
     def _on_packet(self, packet: bytes) -> None:
-        if self.outlet.closed.is_set():
+        if self.outlet.closed:
             return
         if self._direct and self._inbox.empty() and not self.delivery.crowded and self._turn.acquire(blocking=False):
             try:
-                self.outlet.give(self._take(time.time(), packet))
+                now = time.time_ns()
+                self.outlet.give(self._take(now * 1e-9, packet, now))
             except Exception:
                 log.exception("subscription of %s", self.alias)
             finally:
@@ -234,13 +234,15 @@ class Subscription:
     def _work(self) -> None:
         if self._session:
             self._offer()
-        while not self.outlet.closed.is_set():
+        while not self.outlet.closed:
             wake = self._wake()
-            item: tuple[float, bytes] | _Answer | _Retry | None = None
-            with contextlib.suppress(queues.Empty):
+            item: tuple[float, bytes] | _Answer | _Retry | None
+            try:
                 item = self._inbox.get(timeout=None if wake is None else max(0.0, wake - time.monotonic()))
                 if item is None:
                     return
+            except queues.Empty:
+                item = None
             with self._turn:
                 try:
                     while (repair := self._repairs.take()) is not None:  # before the inbox: what it holds waits for them
@@ -285,10 +287,10 @@ class Subscription:
             for received, packet in held:
                 self.outlet.give(self._take(received, packet))
 
-    def _take(self, received: float, packet: bytes | memoryview) -> list[Message]:
-        """Open a packet; the messages that it completes."""
+    def _take(self, received: float, packet: bytes | memoryview, now: int | None = None) -> list[Message]:
+        """Open a packet; the messages that it completes. received: seconds since 1970; now: nanoseconds, None: the clock."""
         try:
-            opened = self.opener.open_many(packet)
+            opened = self.opener.open_many(packet, now=now)
         except Refused as refused:
             self._refused(refused.reason, received, packet)
             return []
