@@ -16,7 +16,10 @@ from typing import Any
 from benchmarks.timing import table
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {"connectivity-speed.md": ("connectivity", "sealing", "proxies"), "benchmarks.md": ("tasks", "console")}
+PAGES = {
+    "connectivity-speed.md": ("connectivity", "sealing", "proxies"),
+    "benchmarks.md": ("loop", "allocation", "gates", "engine", "memory", "tasks", "console"),
+}
 """Pages in docs/, and the benchmarks whose tables they have."""
 RESULTS = ROOT / "results" / "benchmarks"
 PLACE = re.compile(r"(?<=<!-- table: )([\w-]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)
@@ -31,6 +34,62 @@ AUTHENTIC = ("signature", "session", "session, direct", "chain")
 """Stacks whose messages are all authentic when they are delivered."""
 
 Results = dict[str, dict[str, Any]]
+
+
+def loop(results: Results) -> str:
+    """Milliseconds a timestep, and ratios with their targets."""
+    found = results["loop"]["loop"]
+    times = table(
+        ["ms a timestep", *found[0]["milliseconds"]], [[row["task"], *row["milliseconds"].values()] for row in found]
+    )
+    goals = {"original / ours": ">= 3", "ours / floor": "<= 1.15", "overlap / floor": "< 0.9"}
+    rows = [[ratio, goals.get(ratio, ""), *(row["ratios"][ratio] for row in found)] for ratio in found[0]["ratios"]]
+    return f"{times}\n\n{table(['ratio', 'target', *(row['task'] for row in found)], rows)}"
+
+
+def loop_phases(results: Results) -> str:
+    """Where the time of the lock-step loop goes."""
+    found = results["loop"]["loop"]
+    phases = [[phase, *(row["phases"][phase] for row in found)] for phase in found[0]["phases"]]
+    return table(["lock-step, ms a timestep", *(row["task"] for row in found)], phases)
+
+
+def allocation(results: Results) -> str:
+    """Of many robots and of few, against a partial sort."""
+    return table(
+        ["robots x humans: priorities", "ms", "/ np.partition"],
+        [[f"{row['robots']:,} x {row['humans']:,}: {row['ranks']}", row["milliseconds"], row["ratio"]]
+         for row in results["allocation"]["allocation"]],
+    )  # fmt: skip
+
+
+def gates(results: Results) -> str:
+    """What the rules of a gate cost."""
+    return table(
+        ["gate", "robots", "ms a timestep", "rules", "signals", "rules / timestep"],
+        [[*list(row.values())[:-1], f"{row['rules / timestep']:.1%}"] for row in results["gates"]["gates"]],
+    )
+
+
+def engine(results: Results) -> str:
+    """Robot steps a second, a table for each number of robots."""
+    parts = []
+    for robots in dict.fromkeys(row["robots"] for row in results["engine"]["engine"]):
+        rows = [row for row in results["engine"]["engine"] if row["robots"] == robots]
+        head = list(rows[0]["steps a second"])
+        found = [[row["task"], *(_whole(row["steps a second"].get(name)) for name in head)] for row in rows]
+        parts.append(table([f"{robots} robot{'s' * (robots > 1)}", *head], found))
+    return "\n\n".join(parts)
+
+
+def _whole(number: float | None) -> str:
+    return "" if number is None else f"{number:,.0f}"
+
+
+def memory(results: Results) -> str:
+    """Peak resident memory of a run."""
+    rows = [[row["task"], *(_whole(row[key]) for key in list(row)[1:])] for row in results["memory"]["memory"]]
+    return table(["MiB", *list(results["memory"]["memory"][0])[1:]], rows)
 
 
 def machines(results: Results) -> str:
@@ -156,6 +215,12 @@ def console(results: Results) -> str:
 
 
 TABLES: dict[str, tuple[str, Callable[[Results], str]]] = {
+    "loop": ("loop", loop),
+    "loop-phases": ("loop", loop_phases),
+    "allocation": ("allocation", allocation),
+    "gates": ("gates", gates),
+    "engine": ("engine", engine),
+    "memory": ("memory", memory),
     "machines": ("", machines),
     "targets": ("connectivity", targets),
     "round-trips": ("connectivity", round_trips),

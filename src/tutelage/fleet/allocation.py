@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -105,9 +106,9 @@ def highest(ranks: Array, k: int, exclude: Array, rng: np.random.Generator) -> A
     Column by column: a partial sort finds the k-th largest value; robots above it are in, robots equal to it are decided
     by the next column, and at last by a random number, so no robot is preferred for its index. O(N), not O(N log N).
     """
-    if np.isnan(ranks.max(axis=0)).any():  # a maximum is NaN where any number is
-        raise ContractError(f"the priority of robot {int(np.argmax(np.isnan(ranks).any(axis=1)))} is NaN")
     columns = [ranks[:, c] for c in range(ranks.shape[1])]
+    if any(math.isnan(column @ column) for column in columns):  # a sum of squares is NaN where any number is, and only there
+        raise ContractError(f"the priority of robot {int(np.argmax(np.isnan(ranks).any(axis=1)))} is NaN")
     tied = np.empty(0, dtype=np.int64)
     for reach in (_reach(columns[0], k), 0.0):
         if reach > 0:  # at least k robots with so high a first number: the others have no chance
