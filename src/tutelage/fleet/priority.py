@@ -206,7 +206,8 @@ class Lexicographic:
             if column.shape[:1] != (view.num_robots,) or column.ndim > 2:
                 raise ContractError(f"{type(term).__name__} must return ({view.num_robots},), got {column.shape}")
         # Columns stay contiguous: allocation sorts column by column.
-        return np.vstack([column.T for column in columns], dtype=np.float64).T
+        rows = [column[None] if column.ndim == 1 else column.T for column in columns]
+        return np.concatenate(rows, dtype=np.float64).T
 
     def state_dict(self) -> dict[str, Any]:
         """What the terms remember, by position."""

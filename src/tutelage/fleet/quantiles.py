@@ -26,15 +26,15 @@ class StreamingQuantiles:
         highest = math.ceil(-math.log(smallest) / self._log_width)
         self._counts = np.zeros(highest - self._lowest + 2, dtype=np.int64)  # the first bin counts zeros
         self._new: list[Array] = []
+        self._size = 0
 
     def __len__(self) -> int:
-        return int(self.counts.sum())
+        return self._size
 
     def add(self, values: Array) -> None:
         """Take in values (n,) >= 0."""
-        self._new.append(
-            np.array(values, dtype=np.float64)
-        )  # counted together: one value at a time takes as long as a thousand
+        self._new.append(np.array(values, dtype=np.float64))  # counted together: one value takes as long as a thousand
+        self._size += len(values)
         if len(self._new) >= 1000:
             self._count()
 
@@ -57,11 +57,9 @@ class StreamingQuantiles:
         Raises:
             ValueError: nothing was added yet.
         """
-        counts = self.counts
-        total = int(counts.sum())
-        if not total:
+        if not self._size:
             raise ValueError("a quantile of no values")
-        k = int(np.searchsorted(np.cumsum(counts), max(1, math.ceil(q * total))))
+        k = int(np.searchsorted(np.cumsum(self.counts), max(1, math.ceil(q * self._size))))
         if k == 0:
             return 0.0
         upper = math.exp((k - 1 + self._lowest) * self._log_width)
@@ -77,3 +75,4 @@ class StreamingQuantiles:
         """Restore what `state_dict` returned."""
         self._counts[:], self._new = 0, []
         self._counts[state["bins"]] = state["counts"]
+        self._size = int(self._counts.sum())

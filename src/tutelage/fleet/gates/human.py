@@ -31,13 +31,13 @@ class HGDAgger(Gate):
     def __call__(self, view: FleetView) -> Array:
         if self.config.beta_h is None:
             raise ConfigError("HGDAgger needs beta_h as a number before it starts; assemble a run, or give it")
-        none = np.zeros(view.num_robots, dtype=np.int64)
-        bad, good = (none if run is None else run for run in (self.bad, self.good))
+        if self.bad is None or self.good is None:
+            self.bad = self.good = np.zeros(view.num_robots, dtype=np.int64)
         differs = view.signal("judgement")
         sees = self._watched(view) | view.supervised
         going_on = ~view.fresh
-        self.bad = (bad + 1) * (sees & going_on & (differs >= self.config.beta_h))
-        self.good = (good + 1) * (view.supervised & going_on & (differs < self.config.beta_r * self.config.beta_h))
+        self.bad = (self.bad + 1) * (sees & going_on & (differs >= self.config.beta_h))
+        self.good = (self.good + 1) * (view.supervised & going_on & (differs < self.config.beta_r * self.config.beta_h))
         return super().__call__(view)
 
     def ask(self, view: FleetView) -> Array:
@@ -51,6 +51,8 @@ class HGDAgger(Gate):
     def _watched(self, view: FleetView) -> Array:
         """The robots that somebody looks at: the next `span` of each human, in turn."""
         n, seen = view.num_robots, min(self.config.span * view.num_humans, view.num_robots)
+        if seen == n:
+            return np.ones(n, dtype=bool)
         first = view.t // self.config.dwell * seen
         watched = np.zeros(n, dtype=bool)
         watched[(first + np.arange(seen)) % n] = True

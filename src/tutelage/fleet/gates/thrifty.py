@@ -43,7 +43,7 @@ class ThriftyDAgger(Gate):
 
     def __call__(self, view: FleetView) -> Array:
         self._observe(view)
-        if any(math.isnan(value) for value in self.thresholds.values()):
+        if math.isnan(sum(self.thresholds.values())):
             raise ConfigError("ThriftyDAgger needs all four thresholds before it starts; assemble a run, or give them")
         return super().__call__(view)
 
@@ -72,7 +72,7 @@ class ThriftyDAgger(Gate):
         if self.config.without != "risk":
             self.risk.add(1.0 - view.goal[own])
         taught = view.discrepancy[np.isfinite(view.discrepancy)]
-        if len(taught):
+        if taught.size:
             self.taught += len(taught)
             self.discrepancy += float(taught.sum())
         if view.fresh.any() and max(len(self.novelty), len(self.risk)) >= self.config.history:
