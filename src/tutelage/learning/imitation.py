@@ -81,6 +81,7 @@ class ImitationLearner:
 
     def gradient_steps(self, n: int) -> float:
         """n gradient steps of behaviour cloning on all data so far; returns the last loss, mean over members."""
+        loss = 0.0
         for k in range(n):
             if k or self._begun is None:
                 self.regression.begin(self.dataset, self.config.batch)
