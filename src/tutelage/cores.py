@@ -62,7 +62,6 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process has none of these threads
 
 
-@cache
 def one_thread_a_product() -> None:
     """Let compiled code compute each of its matrix products in the thread that asks for it (in this process, for good)."""
     import scipy.linalg.cython_blas  # noqa: F401  the library that compiled code calls must be there to be told

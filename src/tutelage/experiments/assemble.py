@@ -140,7 +140,7 @@ def assemble(config: RunConfig) -> Assembly:
     shape, actions = _obs_shape(fleet, config), len(fleet.action_low)
     config = sized(config, shape)
     # Where vectors are seen, PyTorch computes only what is too small to be worth a meeting of threads.
-    torch.set_num_threads(config.torch_threads or default_torch_threads() if len(shape) == 3 else 1)
+    torch.set_num_threads(config.torch_threads or 1 if len(shape) == 3 else 1)
     keep_freed_memory()
     known = shape[0] if fleet.state is None else fleet.state.shape[1]
     if isinstance(actor, GaussianActor) and (actor.features > known or len(actor.low) != actions):

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tutelage.cores import Together, one_thread_a_product
+from tutelage.cores import Together
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.mlp import Arrays, BatchedMLP
 from tutelage.policies.networks import Network
@@ -59,7 +59,6 @@ class CompiledDescent:
     """
 
     def __init__(self, net: BatchedMLP, learning_rate: float, threads: int) -> None:
-        one_thread_a_product()
         self._threads, self._learning_rate, self._steps = threads, learning_rate, 0
         self._weights, self._biases = net.arrays()
         self._members = len(self._weights[0])

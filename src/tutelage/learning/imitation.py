@@ -76,17 +76,17 @@ class ImitationLearner:
         self.restarts, self._episode_ended = 0, False
         self._heard: int | None = None
         """The timestep whose human data are in the dataset already."""
-        self._begun: int | None = None
-        """The timestep whose first gradient step has begun and has not ended."""
+        self._begun = False
+        """Whether the first gradient step of an update has begun and has not ended."""
 
     def gradient_steps(self, n: int) -> float:
         """n gradient steps of behaviour cloning on all data so far; returns the last loss, mean over members."""
         loss = 0.0
         for k in range(n):
-            if k or self._begun is None:
+            if k or not self._begun:
                 self.regression.begin(self.dataset, self.config.batch)
             loss = self.regression.end()
-        self._begun = None
+        self._begun = False
         self.policy.forget()
         return loss
 
@@ -106,11 +106,8 @@ class ImitationLearner:
     def begin(self, t: int) -> None:
         """Start what is due of the policy at timestep t, unless its schedule waits for the outcome; `update` ends it."""
         self._settle()
-        if self.config.schedule != "episode" and self._due(t):
-            if self.config.schedule == "scratch":
-                self.restart()
-            self.regression.begin(self.dataset, self.config.batch)
-            self._begun = t
+        if self.config.schedule != "episode":
+            self._begin_if_due(t)
 
     def record(self, step: Step) -> None:
         """Human actions into the dataset, unless they were heard; every transition into the critics."""
@@ -129,9 +126,9 @@ class ImitationLearner:
         """What is due at timestep t: the policy, the classifier, which follows it, and the critics, which ask it."""
         losses: dict[str, float] = {}
         c = self.config
-        if self._begun is not None or self._due(t):
-            if self._begun is None and c.schedule == "scratch":
-                self.restart()
+        if not self._begun:
+            self._begin_if_due(t)
+        if self._begun:
             losses["policy"] = self.gradient_steps(c.gradient_steps)
             if self.classifier:
                 losses["classifier"] = self.classifier.updates(c.gradient_steps)
@@ -142,12 +139,12 @@ class ImitationLearner:
 
     def _settle(self) -> None:
         """Wait for what began in a timestep that was given up before its end."""
-        if self._begun is not None:
+        if self._begun:
             self.regression.end()
-            self._begun = None
+            self._begun = False
 
-    def _due(self, t: int) -> bool:
-        """Whether the policy learns at timestep t."""
+    def _begin_if_due(self, t: int) -> None:
+        """Start the policy's first gradient step if it learns at timestep t."""
         c = self.config
         due = {
             "step": (t + 1) % c.every == 0,
@@ -155,7 +152,11 @@ class ImitationLearner:
             "episode": self._episode_ended,
             "never": False,
         }[c.schedule]
-        return due and len(self.dataset) > 0
+        if due and len(self.dataset):
+            if c.schedule == "scratch":
+                self.restart()
+            self.regression.begin(self.dataset, c.batch)
+            self._begun = True
 
     def _add(self, obs: Array, wanted: Array) -> None:
         if len(obs):

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.cores import Together, one_thread_a_product
+from tutelage.policies import networks
 
+one_thread_a_product()
 Array = NDArray[Any]
 
-LIMIT = np.float32(10.0)
-"""Z-scores are clipped to so many standard deviations, as in `networks.normalise`."""
+LIMIT = np.float32(networks.LIMIT)
 ZERO, ONE = np.float32(0), np.float32(1)
 RECTIFIED, TANH, SIGMOID = 0, 1, 2
 """What follows the sums of a layer."""
@@ -124,6 +125,5 @@ def join(obs, action, mean, std, middle, half, x):  # type: ignore[no-untyped-de
 
 def ask_all(kernel: Callable[..., None], networks: int, robots: int, threads: int, *arguments: Any) -> None:
     """kernel(k, start, stop, *arguments) for each network k and all robots, part by part, side by side where it pays."""
-    one_thread_a_product()
     parts = [(k, at, min(at + PART, robots)) for k in range(networks) for at in range(0, robots, PART)]
     Together(1 if robots < FEW else threads, [partial(kernel, *part, *arguments) for part in parts]).results()

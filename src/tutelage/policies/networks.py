@@ -16,6 +16,8 @@ from tutelage.policies.vision import HEAD, BatchedCNN
 Network = BatchedMLP | BatchedCNN
 Shape = int | tuple[int, ...]
 """Of an observation: D for a vector, (H, W, 3) for an image."""
+LIMIT = 10.0
+"""Z-scores of observations are clipped to so many standard deviations."""
 
 
 def shape_of(obs: Shape) -> tuple[int, ...]:
@@ -36,7 +38,7 @@ def as_tensor(obs: NDArray[Any]) -> Tensor:
 
 def normalise(obs: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     """Z-scores, clipped to 10 standard deviations: of each number of a vector (..., D), of each channel of images."""
-    return ((obs - mean) / std).clamp_(-10, 10)
+    return ((obs - mean) / std).clamp_(-LIMIT, LIMIT)
 
 
 def hidden_layers(obs: Shape, hidden: tuple[int, ...] | None, plain: tuple[int, ...] = (256, 256)) -> tuple[int, ...]:
