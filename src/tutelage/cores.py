@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
+from threading import Lock, Thread
 from typing import Any
+
+import numpy as np
 
 
 def available_cores() -> int:
@@ -24,8 +29,9 @@ def default_torch_threads() -> int:
 class Together:
     """Pieces of work that helpers begin in the background, and that whoever waits for them takes a hand in.
 
-    Physics and learning share the helpers: with the thread that waits, they are no more than `threads`. Pieces are to be
-    compiled code, or others that hold no interpreter lock for long, and must not wait for one another.
+    Physics and learning share the helpers: with the thread that waits, they are no more than `threads`. A thread that waits
+    for pieces that helpers have begun does what else there is to do meanwhile, whoever it is for. Pieces are to be compiled
+    code, or others that hold no interpreter lock for long, and must not wait for one another.
 
     Args:
         threads: how many threads compute side by side, the one that waits included. With one, all is done by `results`.
@@ -33,29 +39,111 @@ class Together:
     """
 
     def __init__(self, threads: int, pieces: Sequence[Callable[[], Any]]) -> None:
-        self._pieces = pieces
-        self._futures = [_helpers(threads - 1).submit(piece) for piece in pieces] if threads > 1 else []
+        self._pieces = [_Piece(piece) for piece in pieces]
+        self._helpers = _helpers(threads - 1) if threads > 1 else None
+        if self._helpers:
+            self._helpers.add(self._pieces)
 
     def results(self) -> list[Any]:
-        """Do what nobody has begun, and wait for the rest; what the pieces returned. Raises what they raised."""
-        if not self._futures:
-            return [piece() for piece in self._pieces]
-        found: list[Any] = [None] * len(self._pieces)
-        begun = []
-        for k in reversed(range(len(self._pieces))):  # helpers come from the other end
-            if self._futures[k].cancel():
-                found[k] = self._pieces[k]()
-            else:
-                begun.append(k)
-        for k in begun:
-            found[k] = self._futures[k].result()
-        return found
+        """Do what nobody has begun, and wait for the rest; what the pieces returned. Raises what one of them raised."""
+        for piece in reversed(self._pieces):  # helpers come from the other end
+            piece.do()
+        for piece in self._pieces:
+            while self._helpers and piece.ended.locked() and (other := self._helpers.next()):
+                other.do()
+            with piece.ended:
+                pass
+        for piece in self._pieces:
+            if piece.error is not None:
+                raise piece.error
+        return [piece.result for piece in self._pieces]
+
+
+def share(kernel: Callable[..., None], items: int, threads: int, *arguments: Any) -> Together:
+    """Start some work in the background, in at most so many threads; ask for its `results` before you use what it wrote.
+
+    kernel: compiled code that holds no interpreter lock. kernel(counter, *arguments) does item `claim(counter)`, again and
+        again, until there are no more than that (`tutelage.claims`).
+    """
+    work = partial(kernel, np.zeros(1, dtype=np.intp), *arguments)
+    return Together(threads, [work] * min(threads, items))
+
+
+class _Piece:
+    """Some work, what it returned or raised, and two locks: one for whoever does it, one that is free when it is done."""
+
+    __slots__ = ("begun", "ended", "error", "result", "work")
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self.work, self.result = work, None
+        self.error: BaseException | None = None
+        self.begun, self.ended = Lock(), Lock()
+        self.ended.acquire()
+
+    def do(self) -> None:
+        """Do it, if nobody has begun."""
+        if self.begun.acquire(blocking=False):
+            try:
+                self.result = self.work()
+            except BaseException as error:  # for whoever asks for the result
+                self.error = error
+            self.ended.release()
+
+
+class _Helpers:
+    """Threads that do what there is to do, until this process ends."""
+
+    def __init__(self, number: int) -> None:
+        self._pieces: deque[_Piece] = deque()
+        self._idle: deque[Lock] = deque()  # what each of them that has nothing to do waits for
+        self._over = False
+        self._threads = [Thread(target=self._help, name=f"helper_{k}", daemon=True) for k in range(number)]
+        for thread in self._threads:
+            thread.start()
+        atexit.register(self._end)  # compiled code must not go on while the process takes down what it works on
+
+    def add(self, pieces: Iterable[_Piece]) -> None:
+        """Let helpers do these; as many wake up, all at once."""
+        for piece in pieces:
+            self._pieces.append(piece)
+            self._wake()
+
+    def next(self) -> _Piece | None:
+        """What is to be done next, if anything."""
+        try:
+            return self._pieces.popleft()
+        except IndexError:
+            return None
+
+    def _wake(self) -> None:
+        with contextlib.suppress(IndexError):
+            self._idle.pop().release()
+
+    def _help(self) -> None:
+        woken = Lock()
+        woken.acquire()
+        while not self._over:
+            if piece := self.next():
+                piece.do()
+                del piece  # it holds what it worked on
+                continue
+            self._idle.append(woken)
+            if self._pieces or self._over:  # came before anybody could know that this one is idle
+                self._wake()
+            woken.acquire()
+
+    def _end(self) -> None:
+        self._over = True
+        for _ in self._threads:
+            self._wake()
+        for thread in self._threads:
+            thread.join()
 
 
 @cache
-def _helpers(number: int) -> ThreadPoolExecutor:
+def _helpers(number: int) -> _Helpers:
     """So many threads of this process; the same ones for all who ask for the same number."""
-    return ThreadPoolExecutor(number, thread_name_prefix="helper")
+    return _Helpers(number)
 
 
 if hasattr(os, "register_at_fork"):

@@ -102,10 +102,10 @@ def test_with_overlap_learning_happens_while_physics_runs() -> None:
 
 @pytest.mark.parametrize(
     ("overlap", "order"),
-    [(False, ["hear", "begin", "step_async", "step_wait", "record", "update"]),
-     (True, ["begin", "step_async", "update", "step_wait", "record"])],
+    [(False, ["policy.act", "hear", "begin", "step_async", "step_wait", "record", "update"]),
+     (True, ["begin", "policy.act", "step_async", "update", "step_wait", "record"])],
 )  # fmt: skip
-def test_a_prompt_learner_begins_before_physics_with_what_humans_want_or_with_what_was_before(overlap, order) -> None:
+def test_a_prompt_learner_begins_as_soon_as_it_has_what_it_learns_from(overlap, order) -> None:
     class Prompt(FakeLearner):
         def hear(self, t, obs, wanted) -> None:
             self.log.append("hear")
@@ -118,12 +118,13 @@ def test_a_prompt_learner_begins_before_physics_with_what_humans_want_or_with_wh
     log: list[Any] = []
     heard: list[Any] = []
     begun: list[int] = []
-    loop = make_loop(PointFleet(3, log=log), wants([0.0, 1.0, 0.0]), 1, learner=Prompt(log), overlap=overlap)
+    fleet, policy = PointFleet(3, log=log), FakePolicy(log=log)
+    loop = make_loop(fleet, wants([0.0, 1.0, 0.0]), policy=policy, learner=Prompt(log), overlap=overlap)
     assert isinstance(loop.learner, PromptLearner)
     loop.step()
     log.clear()
     step = loop.step()
-    assert [what for what in log if what in ("step_async", "hear", "begin", "step_wait", "record", "update")] == order
+    assert [what for what in log if what in order] == order
     assert begun == [0, 1]
     assert step.taught.tolist() == [False, True, False]
     assert step.losses == {"policy": 1.0}

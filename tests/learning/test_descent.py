@@ -143,6 +143,21 @@ def test_the_number_of_threads_changes_no_bit() -> None:
         np.testing.assert_array_equal(uncertainty, said[0][1])
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_policy_is_what_it_was_until_the_end_of_a_step(compiled) -> None:
+    policy, data, obs = ensemble((64, 64)), pairs(), default_rng(3).normal(size=(4, 5))
+    learner = regression(policy, 1e-2) if compiled else BatchedRegression(policy, 1e-2)
+    for _ in range(5):
+        before, weights = policy.act(obs), module_state(policy)
+        learner.begin(data, 32)
+        for _ in range(20):
+            np.testing.assert_array_equal(policy.act(obs.copy()), before)
+        assert all(np.array_equal(array, weights[name]) for name, array in module_state(policy).items())
+        learner.end()
+        policy.forget()
+        assert not np.array_equal(policy.act(obs), before)
+
+
 def test_what_goes_wrong_in_the_background_is_raised_at_the_end() -> None:
     policy, data = ensemble((7,)), pairs()
     learner = BatchedRegression(policy, 1e-2)

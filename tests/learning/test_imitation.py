@@ -152,6 +152,25 @@ def test_to_hear_first_what_humans_want_changes_nothing(schedule) -> None:
     assert same(told[0][1], told[1][1])
 
 
+def test_what_began_before_anybody_was_heard_goes_on_beside_critics_that_ask_the_policy_of_the_timestep() -> None:
+    """As a loop with overlap has it: the policy's step is due, and the critics' too, and neither sees the other's."""
+    lessons = lesson(3, ends=(1,))
+    told = []
+    for ahead in (True, False):
+        learner = make(["risk"])
+        for one in lessons:
+            learner.record(one)
+        if ahead:
+            learner.begin(9)
+            losses = learner.update(9)
+        else:
+            losses = {"risk": learner.critics["risk"].update()}
+            losses["policy"] = learner.gradient_steps(1)
+        told.append((losses, learner.state_dict()))
+    assert told[0][0] == told[1][0]
+    assert same(told[0][1], told[1][1])
+
+
 def same(one, other) -> bool:
     """Whether two trees of arrays and values are equal to the bit."""
     if isinstance(one, dict):

@@ -18,7 +18,8 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from tutelage.cores import Together, available_cores
+from tutelage.claims import claim
+from tutelage.cores import Together, available_cores, share
 from tutelage.errors import MissingExtraError
 
 try:
@@ -45,18 +46,6 @@ _mj_forward = types.ExternalFunction("mj_forward", types.void(_P, _P))
 _mj_reset = types.ExternalFunction("mj_resetData", types.void(_P, _P))
 _mj_contact_forces = types.ExternalFunction("mj_rnePostConstraint", types.void(_P, _P))
 _memmove = types.ExternalFunction("memmove", _P(_P, _P, types.uintp))
-
-
-@intrinsic
-def _claim(typing, address):  # type: ignore[no-untyped-def]
-    """The integer at an address, which is one more afterwards, whoever else asks at the same time (an atomic increment)."""
-
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        kind = context.get_value_type(types.intp)
-        pointer = builder.inttoptr(arguments[0], kind.as_pointer())
-        return builder.atomic_rmw("add", pointer, kind(1), "monotonic")
-
-    return types.intp(types.intp), generate
 
 
 @intrinsic
@@ -99,11 +88,11 @@ def _gather(i, sources, sizes, frame_address, frame_width):  # type: ignore[no-u
 
 @numba.njit(nogil=True, cache=True)
 def _advance(  # type: ignore[no-untyped-def]
-    robots, next_one, models, datas, substeps, forces, unstable, qpos_at, nq, qvel_at, nv,
+    counter, robots, models, datas, substeps, forces, unstable, qpos_at, nq, qvel_at, nv,
     ctrl_at, ctrl_address, ctrl_width, push_at, push_address, sources, sizes, frame_address, frame_width,
 ):  # fmt: skip
     while True:
-        claimed = _claim(next_one)
+        claimed = claim(counter)
         if claimed >= len(robots):
             return
         i = robots[claimed]
@@ -127,11 +116,11 @@ def _advance(  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def _restart(  # type: ignore[no-untyped-def]
-    robots, next_one, models, datas, unstable,
+    counter, robots, models, datas, unstable,
     qpos_at, qpos_address, nq, qvel_at, qvel_address, nv, sources, sizes, frame_address, frame_width,
 ):  # fmt: skip
     while True:
-        claimed = _claim(next_one)
+        claimed = claim(counter)
         if claimed >= len(robots):
             return
         i = robots[claimed]
@@ -236,8 +225,10 @@ class Physics:
         """
         self._ctrl[:] = ctrl
         self._push[:] = 0.0 if push is None else push
-        return self._spread(
-            _advance, robots,
+        robots = np.ascontiguousarray(robots, dtype=np.intp)
+        # Falls and contacts take longer, so robots are claimed one by one.
+        return share(
+            _advance, len(robots), self.threads, robots,
             self._models_at, self._datas_at, substeps, self._forces, self.unstable,
             self._qpos_at, self.model.nq, self._qvel_at, self.model.nv,
             self._ctrl_at, _address(self._ctrl), self.model.nu, self._push_at, _address(self._push),
@@ -247,8 +238,9 @@ class Physics:
     def restart(self, robots: Array, qpos: Array, qvel: Array) -> None:
         """Put the given robots (n indices) at qpos (n, nq) and qvel (n, nv), everything else at its initial value."""
         self._qpos[robots], self._qvel[robots] = qpos, qvel
-        self._spread(
-            _restart, robots,
+        robots = np.ascontiguousarray(robots, dtype=np.intp)
+        share(
+            _restart, len(robots), self.threads, robots,
             self._models_at, self._datas_at, self.unstable,
             self._qpos_at, _address(self._qpos), self.model.nq, self._qvel_at, _address(self._qvel), self.model.nv,
             self._sources, self._sizes, _address(self._frame), self._width,
@@ -260,17 +252,6 @@ class Physics:
             self.datas[robot].qpos[:] = row
         if "qpos" in self.frame:
             self.frame["qpos"][robots] = qpos
-
-    def _spread(self, kernel: Any, robots: Array, *arguments: Any) -> Together:
-        robots = np.ascontiguousarray(robots, dtype=np.intp)
-        # The threads claim robots one by one from a common counter, in compiled code: falls and contacts take longer, and
-        # none of them waits for the interpreter lock while training holds it.
-        counter = np.zeros(1, dtype=np.intp)
-
-        def work() -> None:
-            kernel(robots, _address(counter), *arguments)
-
-        return Together(self.threads, [work] * min(self.threads, len(robots)))
 
     def get_state(self) -> Array:
         """Full integration state of every robot, (N, S) float64: what is needed to continue bit for bit."""

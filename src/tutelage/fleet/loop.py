@@ -2,7 +2,8 @@
 
     observe -> score -> allocate -> act -> step -> reset and re-observe -> record -> learn
 
-What is learned from humans alone may be learned during the step: what they want is known before it (`PromptLearner`).
+What is learned from humans alone may be learned while robots move: what humans want is known before (`PromptLearner`). With
+`overlap`, the policy learns from the timesteps before during the whole of this one.
 
 A single robot with one human is a fleet with N = M = 1. Everything else (recording, progress, checkpoints, plots, the
 console) subscribes to the loop's steps; the loop does not know it.
@@ -46,7 +47,7 @@ class Loop:
         signals: how to compute what the priority looks at, by name; `uncertainty` is the policy's own by default.
         subscribers: listeners.
         execution: what a robot executes while a human is in control; by default what the human wants.
-        overlap: learn everything while physics runs. The update at step t then sees the data up to t - 1; it still changes
+        overlap: learn during the whole of a timestep. The update at step t then sees the data up to t - 1; it still changes
             the policy from t + 1 on.
         wait: robots that need a human stand still until one is with them, instead of going on by themselves meanwhile.
         seed: root seed.
@@ -114,6 +115,8 @@ class Loop:
     def step(self) -> Step:
         """One timestep of all robots."""
         self.journal.t, self.in_step = self.t, True
+        if self._prompt and self.overlap:
+            self._prompt.begin(self.t)
         self._reach()
         view = self._observe()
         waiting = self._allocate(self.priority(view))
@@ -121,10 +124,9 @@ class Loop:
         held = silent | waiting
         losses: dict[str, float] = {}
 
-        if self._prompt:
-            if not self.overlap:
-                taught = (mode == Mode.TELEOPERATED) & ~held
-                self._prompt.hear(self.t, view.obs[taught], wanted[taught])
+        if self._prompt and not self.overlap:
+            taught = (mode == Mode.TELEOPERATED) & ~held
+            self._prompt.hear(self.t, view.obs[taught], wanted[taught])
             self._prompt.begin(self.t)
         self.fleet.step_async(actions, active=MOVING[mode] & ~held)
         if self.learner and self.overlap:

@@ -63,5 +63,5 @@ class PromptLearner(Learner, Protocol):
         ...
 
     def begin(self, t: int) -> None:
-        """Start to learn in the background, beside physics, from all data so far."""
+        """Start to learn in the background from all data so far. What the policy says stays the same until `update`."""
         ...

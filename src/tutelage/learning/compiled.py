@@ -9,6 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from tutelage.claims import claim
 from tutelage.policies.compiled import FAST, ONE, RECTIFIED, SIGMOID, TANH, ZERO, join, layer, normalise_row
 
 BETA_1, BETA_2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-8)
@@ -17,9 +18,19 @@ TWO = np.float32(2)
 
 
 @numba.njit(nogil=True, cache=True)
-def imitate(  # type: ignore[no-untyped-def]
+def imitate(counter, losses, *arguments):  # type: ignore[no-untyped-def]
+    """`_imitate` for network after network that is claimed; what it returns for each into losses (K,)."""
+    while True:
+        k = claim(counter)
+        if k >= len(losses):
+            return
+        losses[k] = _imitate(k, *arguments)
+
+
+@numba.njit(nogil=True, cache=True)
+def _imitate(  # type: ignore[no-untyped-def]
     k, obs, actions, index, mean, std, middle, half,
-    weights, biases, values, deltas, gradient, first, second, rate, correction,
+    weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction,
 ):  # fmt: skip
     """One step of tanh network k towards the human actions in its batch (eq. 5.3); returns its mean squared error before.
 
@@ -34,7 +45,7 @@ def imitate(  # type: ignore[no-untyped-def]
         normalise_row(obs[index[k, i]], mean, std, values[0][k, i])
     _forward(k, weights, biases, values, TANH)
     loss = _imitation_error(values[-1][k], actions, index[k], middle, half, deltas[-1][k])
-    _descend(k, weights, biases, values, deltas, gradient, first, second, rate, correction)
+    _descend(k, weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction)
     return loss
 
 
@@ -51,16 +62,26 @@ def _imitation_error(said, actions, index, middle, half, delta):  # type: ignore
 
 
 @numba.njit(nogil=True, cache=True)
-def criticise(  # type: ignore[no-untyped-def]
+def criticise(counter, losses, *arguments):  # type: ignore[no-untyped-def]
+    """`_criticise` for network after network that is claimed; what it returns for each into losses (K,)."""
+    while True:
+        k = claim(counter)
+        if k >= len(losses):
+            return
+        losses[k] = _criticise(k, *arguments)
+
+
+@numba.njit(nogil=True, cache=True)
+def _criticise(  # type: ignore[no-untyped-def]
     k, obs, actions, target, mean, std, middle, half, slow_weights, slow_biases, tau,
-    weights, biases, values, deltas, gradient, first, second, rate, correction,
+    weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction,
 ):  # fmt: skip
     """One step of critic k towards `target`, and of its slow copy towards it; returns its mean squared error before.
 
     Args:
         k: which of the K sigmoid networks.
         obs, actions, target: (B, D), (B, A) and (B,) float32: the batch of all networks.
-        mean, std, middle, half: see `imitate`.
+        mean, std, middle, half: see `_imitate`.
         slow_weights, slow_biases, tau: the target network, which goes tau of the way.
         weights, and all that follows: see `_descend`.
     """
@@ -68,10 +89,10 @@ def criticise(  # type: ignore[no-untyped-def]
         join(obs[i], actions[i], mean, std, middle, half, values[0][k, i])
     _forward(k, weights, biases, values, SIGMOID)
     loss = _critic_error(values[-1][k], target, deltas[-1][k])
-    _descend(k, weights, biases, values, deltas, gradient, first, second, rate, correction)
+    _descend(k, weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction)
     for number in range(len(weights)):
-        _approach(slow_weights[number][k].ravel(), weights[number][k].ravel(), tau)
-        _approach(slow_biases[number][k].ravel(), biases[number][k].ravel(), tau)
+        _approach(slow_weights[number][k].ravel(), new_weights[number][k].ravel(), tau)
+        _approach(slow_biases[number][k].ravel(), new_biases[number][k].ravel(), tau)
     return loss
 
 
@@ -103,11 +124,14 @@ def _forward(k, weights, biases, values, kind):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)
-def _descend(k, weights, biases, values, deltas, gradient, first, second, rate, correction):  # type: ignore[no-untyped-def]
+def _descend(  # type: ignore[no-untyped-def]
+    k, weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction
+):
     """Network k goes one step of Adam down the gradient that deltas[-1] begins. All arrays are float32 and contiguous.
 
     Args:
-        weights, biases: a layer's (K, a, b) and (K, 1, b), for each layer; changed.
+        weights, biases: a layer's (K, a, b) and (K, 1, b), for each layer.
+        new_weights, new_biases: where those after the step go.
         values: (K, B, D), then (K, B, b) for each layer: what it says.
         deltas: (K, B, b) for each layer: the gradient with respect to its sums; room for all but the last.
         gradient: (K, P): room for the gradient of each layer's weights and then its biases.
@@ -120,11 +144,14 @@ def _descend(k, weights, biases, values, deltas, gradient, first, second, rate, 
         start, between = stop - (a + 1) * b, stop - b
         np.dot(values[number][k].T, deltas[number][k], gradient[k, start:between].reshape((a, b)))
         _sum_rows(deltas[number][k], gradient[k, between:stop])
-        if number:  # before the weights change
+        if number:
             np.dot(deltas[number][k], weights[number][k].T, deltas[number - 1][k])
             _mask(deltas[number - 1][k], values[number][k])
-        for parameter, i, j in ((weights[number][k].ravel(), start, between), (biases[number][k].ravel(), between, stop)):
-            _adam(parameter, gradient[k, i:j], first[k, i:j], second[k, i:j], rate, correction)
+        for old, new, i, j in (
+            (weights[number][k].ravel(), new_weights[number][k].ravel(), start, between),
+            (biases[number][k].ravel(), new_biases[number][k].ravel(), between, stop),
+        ):
+            _adam(old, new, gradient[k, i:j], first[k, i:j], second[k, i:j], rate, correction)
         stop = start
 
 
@@ -146,10 +173,10 @@ def _sum_rows(x, total):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST)
-def _adam(parameter, gradient, first, second, rate, correction):  # type: ignore[no-untyped-def]
-    """Adam on n numbers, in place."""
-    for i in range(parameter.shape[0]):
+def _adam(old, new, gradient, first, second, rate, correction):  # type: ignore[no-untyped-def]
+    """Adam on n numbers."""
+    for i in range(old.shape[0]):
         g = gradient[i]
         first[i] += (ONE - BETA_1) * (g - first[i])
         second[i] = BETA_2 * second[i] + (ONE - BETA_2) * g * g
-        parameter[i] -= rate * first[i] / (np.sqrt(second[i]) * correction + EPSILON)
+        new[i] = old[i] - rate * first[i] / (np.sqrt(second[i]) * correction + EPSILON)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tutelage.cores import Together
+from tutelage.cores import Together, share
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
 from tutelage.policies.mlp import Arrays, BatchedMLP
 from tutelage.policies.networks import Network
@@ -36,9 +35,18 @@ class Descent:
 
     def step(self, losses: Tensor) -> float:
         """One step of every network down its loss, (K,); returns the mean of the losses."""
+        loss = self.look(losses)
+        self.go()
+        return loss
+
+    def look(self, losses: Tensor) -> float:
+        """The first half of a step, which changes no network: what is down for each loss, (K,); returns their mean."""
         torch._foreach_copy_(self.gradients, torch.autograd.grad(losses.sum(), self.parameters))
-        self.optimiser.step()
         return float(losses.detach().sum()) / len(losses)
+
+    def go(self) -> None:
+        """The second half."""
+        self.optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:
         """The moments of each parameter of the K networks, by position (copies)."""
@@ -53,43 +61,49 @@ class CompiledDescent:
     """Adam on K multilayer perceptrons of one shape, each in a thread of its own; see `learning.compiled`.
 
     Args:
-        net: the networks. Their weights stay where they are: what loads others into `net` changes what is learned from.
+        net: the networks. They are what they were from `begin` to `end`, so they may be asked meanwhile.
         learning_rate: of Adam.
         threads: see `Together`.
     """
 
     def __init__(self, net: BatchedMLP, learning_rate: float, threads: int) -> None:
         self._threads, self._learning_rate, self._steps = threads, learning_rate, 0
-        self._weights, self._biases = net.arrays()
-        self._members = len(self._weights[0])
-        size = sum(weight[0].size + bias[0].size for weight, bias in zip(self._weights, self._biases, strict=True))
+        self._net = net
+        self._new = tuple(tuple(np.empty_like(array) for array in arrays) for arrays in net.arrays())
+        self._members = len(self._new[0][0])
+        self._losses = np.zeros(self._members)
+        size = sum(array[0].size for arrays in self._new for array in arrays)
         self._gradient, self._first, self._second = (np.zeros((self._members, size), np.float32) for _ in range(3))
         self._values: Arrays = ()
         self._deltas: Arrays = ()
         self._begun = Together(1, [])
 
-    def begin(self, kernel: Callable[..., float], batch: int, *data: Any) -> None:
+    def begin(self, kernel: Callable[..., None], batch: int, *data: Any) -> None:
         """Start a step of every network in the background.
 
-        kernel: `imitate` or `criticise`; batch: how many pairs; data: the arguments of the kernel between k and weights.
+        kernel: `imitate` or `criticise`; batch: how many pairs; data: its arguments between losses and weights.
         """
         if not self._values or self._values[0].shape[1] != batch:
             self._values, self._deltas = self._rooms(batch)
         self._steps += 1
         rate = np.float32(self._learning_rate / (1 - 0.9**self._steps))
         correction = np.float32(1 / np.sqrt(1 - 0.999**self._steps))
-        layers = self._weights, self._biases, self._values, self._deltas
+        layers = *self._net.arrays(), *self._new, self._values, self._deltas
         adam = self._gradient, self._first, self._second, rate, correction
-        pieces = [partial(kernel, k, *data, *layers, *adam) for k in range(self._members)]
-        self._begun = Together(self._threads, pieces)
+        self._begun = share(kernel, self._members, self._threads, self._losses, *data, *layers, *adam)
 
     def end(self) -> float:
         """Wait for what began; returns the mean of the losses before it."""
-        return float(sum(self._begun.results())) / self._members
+        self._begun.results()
+        before = self._net.arrays()
+        self._net.adopt(*self._new)
+        self._new = before
+        return float(sum(self._losses.tolist())) / self._members
 
     def _rooms(self, batch: int) -> tuple[Arrays, Arrays]:
         """Room for what the layers say of a batch, and for its gradients."""
-        inputs, *widths = self._weights[0].shape[1], *(weight.shape[2] for weight in self._weights)
+        weights, _ = self._new
+        inputs, *widths = weights[0].shape[1], *(weight.shape[2] for weight in weights)
         values, deltas = (
             tuple(np.empty((self._members, batch, width), np.float32) for width in row)
             for row in ([inputs, *widths], widths)
@@ -118,7 +132,7 @@ class CompiledDescent:
         weights: list[Array] = []
         biases: list[Array] = []
         start = 0
-        for weight, bias in zip(self._weights, self._biases, strict=True):
+        for weight, bias in zip(*self._new, strict=True):
             for array, parts in ((weight, weights), (bias, biases)):
                 stop = start + array[0].size
                 parts.append(flat[:, start:stop].reshape(array.shape))

@@ -104,9 +104,9 @@ class ImitationLearner:
         self._add(obs, wanted)
 
     def begin(self, t: int) -> None:
-        """Start what is due of the policy at timestep t, unless its schedule waits for the outcome; `update` ends it."""
+        """Start what is due of the policy at timestep t, if that goes on from its present weights; `update` ends it."""
         self._settle()
-        if self.config.schedule != "episode":
+        if self.config.schedule == "step":
             self._begin_if_due(t)
 
     def record(self, step: Step) -> None:
@@ -123,24 +123,36 @@ class ImitationLearner:
                 critic.add(obs, action, after, event, end=violation | (success & ~step.truncated[moved]))
 
     def update(self, t: int) -> dict[str, float]:
-        """What is due at timestep t: the policy, the classifier, which follows it, and the critics, which ask it."""
-        losses: dict[str, float] = {}
-        c = self.config
-        if not self._begun:
-            self._begin_if_due(t)
-        if self._begun:
-            losses["policy"] = self.gradient_steps(c.gradient_steps)
-            if self.classifier:
-                losses["classifier"] = self.classifier.updates(c.gradient_steps)
-        for name, critic in self.critics.items():
-            if c.schedule != "never" and (t + 1) % critic.config.every == 0:
-                losses[name] = critic.update()
+        """What is due at timestep t: the policy, the classifier, which follows it, and the critics, which ask it.
+
+        If the policy's step began before humans were heard at t, critics learn beside it, and ask the policy of t.
+        """
+        if self._begun and self._heard != t:
+            losses = self._update_critics(t)
+            losses.update(self._update_policy())
+        else:
+            if not self._begun:
+                self._begin_if_due(t)
+            losses = self._update_policy() if self._begun else {}
+            losses.update(self._update_critics(t))
         return {name: loss for name, loss in losses.items() if np.isfinite(loss)}
+
+    def _update_policy(self) -> dict[str, float]:
+        losses = {"policy": self.gradient_steps(self.config.gradient_steps)}
+        if self.classifier:
+            losses["classifier"] = self.classifier.updates(self.config.gradient_steps)
+        return losses
+
+    def _update_critics(self, t: int) -> dict[str, float]:
+        if self.config.schedule == "never":
+            return {}
+        return {name: critic.update() for name, critic in self.critics.items() if (t + 1) % critic.config.every == 0}
 
     def _settle(self) -> None:
         """Wait for what began in a timestep that was given up before its end."""
         if self._begun:
             self.regression.end()
+            self.policy.forget()
             self._begun = False
 
     def _begin_if_due(self, t: int) -> None:

@@ -18,11 +18,11 @@ class Regression(Protocol):
     """Adam on the mean squared error of each member of an ensemble."""
 
     def begin(self, data: AggregatedDataset, batch: int) -> None:
-        """Draw a batch for each member, and start one gradient step in the background."""
+        """Draw a batch for each member, and start one gradient step in the background; the policy changes in `end`."""
         ...
 
     def end(self) -> float:
-        """Wait for the step; returns the loss before it, mean over members."""
+        """Wait for the step, and let the policy take it; returns the loss before it, mean over members."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -77,16 +77,17 @@ class BatchedRegression:
         self._descent = Descent(policy.net, learning_rate)
 
     def begin(self, data: AggregatedDataset, batch: int) -> None:
-        step = partial(self._step, *data.batches(batch), torch.get_num_threads())
-        self._begun = Together(self._policy.threads, [step])
+        look = partial(self._look, *data.batches(batch), torch.get_num_threads())
+        self._begun = Together(self._policy.threads, [look])
 
     def end(self) -> float:
         (loss,) = self._begun.results()
+        self._descent.go()
         return float(loss)
 
-    def _step(self, obs: torch.Tensor, actions: torch.Tensor, threads: int) -> float:
+    def _look(self, obs: torch.Tensor, actions: torch.Tensor, threads: int) -> float:
         torch.set_num_threads(threads)  # each thread has a number of its own
-        return self._descent.step(self._policy.loss(obs, actions))
+        return self._descent.look(self._policy.loss(obs, actions))
 
     def state_dict(self) -> dict[str, Any]:
         return self._descent.state_dict()

@@ -61,19 +61,19 @@ class CompiledTwins:
         largest: bool, learning_rate: float, tau: float, threads: int,
     ) -> None:  # fmt: skip
         from tutelage.learning.compiled import criticise
-        from tutelage.policies.compiled import ask_all, critic
+        from tutelage.policies.compiled import ask_all, critics
 
         self.descent = CompiledDescent(net, learning_rate, threads)
-        self._ask_all, self._critic, self._criticise = ask_all, critic, criticise
-        self._net, self._target = net.arrays(), target.arrays()
+        self._ask_all, self._critics, self._criticise = ask_all, critics, criticise
+        self._net, self._target = net, target.arrays()
         self._scale, self._tau = tuple(s.numpy() for s in scale), np.float32(tau)
         self._largest, self._threads = largest, threads
 
     def ask(self, obs: Array, actions: Array, of_target: bool = False) -> Array:
         obs, actions = (np.ascontiguousarray(x, dtype=np.float32) for x in (obs, actions))
         said = np.empty((2, len(obs), 1), np.float32)
-        arrays = self._target if of_target else self._net
-        self._ask_all(self._critic, 2, len(obs), self._threads, obs, actions, *self._scale, *arrays, said)
+        arrays = self._target if of_target else self._net.arrays()
+        self._ask_all(self._critics, said, self._threads, obs, actions, *self._scale, *arrays)
         return np.asarray((said.max if self._largest else said.min)(axis=0)[:, 0])
 
     def step(self, obs: Array, actions: Array, y: Array) -> float:

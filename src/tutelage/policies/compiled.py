@@ -7,14 +7,14 @@ the same robots whatever the number of threads, and its numbers come from one th
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.cores import Together, one_thread_a_product
+from tutelage.claims import claim
+from tutelage.cores import one_thread_a_product, share
 from tutelage.policies import networks
 
 one_thread_a_product()
@@ -70,7 +70,35 @@ def _forward(x, k, weights, biases, kind, said):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)
-def member(k, start, stop, obs, mean, std, weights, biases, said):  # type: ignore[no-untyped-def]
+def members(counter, said, *arguments):  # type: ignore[no-untyped-def]
+    """`_member` for each network and part of the robots that is claimed."""
+    while True:
+        k, start, stop = _part(claim(counter), said)
+        if k >= len(said):
+            return
+        _member(k, start, stop, said, *arguments)
+
+
+@numba.njit(nogil=True, cache=True)
+def critics(counter, said, *arguments):  # type: ignore[no-untyped-def]
+    """`_critic` for each network and part of the robots that is claimed."""
+    while True:
+        k, start, stop = _part(claim(counter), said)
+        if k >= len(said):
+            return
+        _critic(k, start, stop, said, *arguments)
+
+
+@numba.njit(nogil=True, cache=True)
+def _part(number, said):  # type: ignore[no-untyped-def]
+    """Which network (K or more: none), and which robots: from, to."""
+    robots = said.shape[1]
+    k, part = divmod(number, -(-robots // PART))
+    return k, part * PART, min((part + 1) * PART, robots)
+
+
+@numba.njit(nogil=True, cache=True)
+def _member(k, start, stop, said, obs, mean, std, weights, biases):  # type: ignore[no-untyped-def]
     """What tanh network k says of robots start to stop, into said (K, N, A), in units of half the range of actions.
 
     obs: (N, D) float32; mean, std: (D,), to normalise them; weights, biases: (K, a, b) and (K, 1, b) for each layer.
@@ -103,10 +131,10 @@ def mean_and_variance(said, middle, half, action, variance):  # type: ignore[no-
 
 
 @numba.njit(nogil=True, cache=True)
-def critic(k, start, stop, obs, actions, mean, std, middle, half, weights, biases, said):  # type: ignore[no-untyped-def]
+def _critic(k, start, stop, said, obs, actions, mean, std, middle, half, weights, biases):  # type: ignore[no-untyped-def]
     """What sigmoid network k says of robots start to stop, into said (K, N, 1).
 
-    obs, actions: (N, D), (N, A) float32; middle, half: (A,), to normalise actions; all else as in `member`.
+    obs, actions: (N, D), (N, A) float32; middle, half: (A,), to normalise actions; all else as in `_member`.
     """
     x = np.empty((stop - start, obs.shape[1] + actions.shape[1]), np.float32)
     for i in range(stop - start):
@@ -123,7 +151,11 @@ def join(obs, action, mean, std, middle, half, x):  # type: ignore[no-untyped-de
         x[width + j] = (action[j] - middle[j]) / half[j]
 
 
-def ask_all(kernel: Callable[..., None], networks: int, robots: int, threads: int, *arguments: Any) -> None:
-    """kernel(k, start, stop, *arguments) for each network k and all robots, part by part, side by side where it pays."""
-    parts = [(k, at, min(at + PART, robots)) for k in range(networks) for at in range(0, robots, PART)]
-    Together(1 if robots < FEW else threads, [partial(kernel, *part, *arguments) for part in parts]).results()
+def ask_all(kernel: Callable[..., None], said: Array, threads: int, *arguments: Any) -> None:
+    """kernel(counter, said, *arguments) for K networks and N robots, part by part, side by side where it pays.
+
+    said: (K, N, outputs), where their answers go.
+    """
+    networks, robots = said.shape[:2]
+    if robots:
+        share(kernel, networks * -(-robots // PART), 1 if robots < FEW else threads, said, *arguments).results()

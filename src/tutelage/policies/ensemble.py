@@ -133,11 +133,11 @@ class EnsemblePolicy(nn.Module):
         return self._said
 
     def _ask_compiled(self, obs: Array, net: BatchedMLP) -> tuple[Array, Array]:
-        from tutelage.policies.compiled import ask_all, mean_and_variance, member
+        from tutelage.policies.compiled import ask_all, mean_and_variance, members
 
         obs, (mean, std, middle, half) = np.ascontiguousarray(obs, dtype=np.float32), self.scale
         said = np.empty((self.members, len(obs), self.outputs), np.float32)
-        ask_all(member, self.members, len(obs), self.threads, obs, mean, std, *net.arrays(), said)
+        ask_all(members, said, self.threads, obs, mean, std, *net.arrays())
         action, variance = np.empty(said.shape[1:], np.float32), np.empty(len(obs), np.float32)
         mean_and_variance(said, middle, half, action, variance)
         return action, variance

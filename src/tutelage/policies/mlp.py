@@ -65,3 +65,8 @@ class BatchedMLP(nn.Module):
         """Weights (K, a, b) and biases (K, 1, b) of each layer as arrays, which share their memory with the parameters."""
         weights, biases = zip(*((w.detach().numpy(), b.detach().numpy()) for w, b in self._layers), strict=True)
         return weights, biases
+
+    def adopt(self, weights: Arrays, biases: Arrays) -> None:
+        """Let these arrays, of the same shapes, be the parameters from now on; those of before are free."""
+        for (weight, bias), new_weight, new_bias in zip(self._layers, weights, biases, strict=True):
+            weight.data, bias.data = torch.from_numpy(new_weight), torch.from_numpy(new_bias)
