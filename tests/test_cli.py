@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small import FLAGS, assert_same, points, walker
+from small import FLAGS, Worry, assert_same, points, walker
 
 import tutelage
 from tutelage import cli
@@ -102,6 +102,21 @@ def test_a_run_with_a_fleet_of_ones_own(tut: Callable[..., Said], tmp_path: Path
     assert said.out == f"{tmp_path / 'run'} is complete at timestep 30; nothing to do\n"
 
 
+def test_a_run_with_threads_for_a_fleet_that_takes_none(tut: Callable[..., Said], tmp_path: Path) -> None:
+    said = tut("run", "small:point_fleet", *POINTS, "--threads", 2, "--out", tmp_path / "run")
+    assert (said.code, said.err) == (0, "")
+
+
+def test_a_run_with_a_priority_of_ones_own(tut: Callable[..., Said], tmp_path: Path) -> None:
+    said = tut("run", "small:point_fleet", *POINTS, "--priority", "small:Worry", "--out", tmp_path / "run")
+    assert (said.code, said.err) == (0, "")
+    assert "small:Worry  30/30" in said.out
+    said = tut("evaluate", tmp_path / "run", "--steps", 20, "--priority", "small:Worry")
+    assert (said.code, said.err) == (0, "")
+    pytest.importorskip("matplotlib")
+    assert "small:Worry" in tut("report", tmp_path / "run").out
+
+
 def test_evaluate(tut: Callable[..., Said], folder: Path) -> None:
     said = tut("evaluate", folder, "--steps", 20)
     assert (said.code, said.err) == (0, "")
@@ -171,6 +186,10 @@ class Undecided:
     """Neither a policy nor a supervisor."""
 
 
+class Curious(Worry):
+    needs = ("risk", "gossip")  # type: ignore[assignment]
+
+
 class Teacher:
     def act(self, obs: Any, robots: Any) -> Any:
         return np.zeros((len(obs), 6), dtype=np.float32)
@@ -186,6 +205,7 @@ class Standing:
     [
         ("env", "Walker2d", "Walker2d keeps the contract of an env\n"),
         ("priority", "C.U.R.", "C.U.R. keeps the contract of a priority\n"),
+        ("priority", "small:Worry", "small:Worry keeps the contract of a priority\n"),
         ("policy", "test_cli:Standing", "test_cli:Standing keeps the contract of a policy\n"),
         ("supervisor", "test_cli:Teacher", "test_cli:Teacher keeps the contract of a supervisor\n"),
     ],
@@ -355,6 +375,20 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["check", "policy", "test_cli"], "policy 'test_cli': module 'test_cli' has no callable ''"),
         (["check", "policy", "test_cli:Undecided"], "Undecided is no policy; it needs act(obs)"),
         (["check", "supervisor", "test_cli:Undecided"], "Undecided is no supervisor; it needs act(obs, robots)"),
+        (
+            ["run", "Walker2d", "--priority", "nowhere:Mine"],
+            "priority 'nowhere:Mine': no module 'nowhere'; install it, or run where Python finds it",
+        ),
+        (["run", "Walker2d", "--priority", "small:Mine"], "priority 'small:Mine': module 'small' has no callable 'Mine'"),
+        (["run", "Walker2d", "--priority", "small:FLAGS"], "priority 'small:FLAGS': module 'small' has no callable 'FLAGS'"),
+        (["run", "Walker2d", "--priority", "test_cli:Standing"], "priority 'test_cli:Standing' must return a priority, *"),
+        (
+            ["run", "Walker2d", "--priority", "test_cli:Curious"],
+            "test_cli:Curious needs the signal gossip, and a run has uncertainty, risk, goal, predicted_discrepancy and "
+            "judgement; others go into a Loop of yours",
+        ),
+        (["check", "priority", "test_cli:Undecided"], "priority 'test_cli:Undecided' must return a priority, *"),
+        (["check", "policy", "small:point_fleet"], "policy 'small:point_fleet' cannot be made: missing a required *"),
         (["check", "priority", "Z."], "cannot read the priority 'Z.': use different terms of *"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -92,7 +92,8 @@ def evaluate(
     Args:
         folder: the run folder whose policy is evaluated.
         steps: timesteps.
-        priority: who gets help: "C." gives hard resets only, "U.C." also teleoperation of uncertain robots.
+        priority: who gets help: "C." gives hard resets only, "U.C." also teleoperation of uncertain robots; or
+            module:callable, a priority of yours.
         expert: evaluate the algorithmic supervisor itself, for reference.
     """
     from tutelage.experiments.evaluate import evaluate_run
@@ -213,18 +214,19 @@ def check(
         console.print(f"{name} keeps the contract of a driver", highlight=False)
         return
     from tutelage import checks
-    from tutelage.envs.registry import load_object, make_fleet
-    from tutelage.fleet.priority import parse
+    from tutelage.envs.registry import make_fleet
+    from tutelage.fleet.priority import own_priority, parse
+    from tutelage.objects import make_object
 
     fleet = make_fleet(name if kind == "env" else task, 4)
     if kind == "env":
         checks.check_env(fleet)
     elif kind == "priority":
-        checks.check_priority(load_object(name, kind)() if ":" in name else parse(name), fleet)
+        checks.check_priority(own_priority(name) if ":" in name else parse(name), fleet)
     elif kind == "policy":
-        checks.check_policy(load_object(name, kind)(), fleet)
+        checks.check_policy(make_object(name, kind), fleet)
     else:
-        checks.check_supervisor(load_object(name, kind)(), fleet)
+        checks.check_supervisor(make_object(name, kind), fleet)
     fleet.close()
     console.print(f"{name} keeps the contract of {'an' if kind == 'env' else 'a'} {kind}", highlight=False)
 
