@@ -9,8 +9,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -229,18 +230,48 @@ def flags(cls: Any, prefix: str = "") -> set[str]:
     return names
 
 
+def described(out: str) -> dict[str, str]:
+    """What help says of each option, on one line."""
+    parts = re.split(r"^ *(--?[a-z][\w.-]*)(?=[ ,])", re.sub(r"[│╭╰─╮╯]", " ", out), flags=re.MULTILINE)[1:]
+    return {name: " ".join(body.split()) for name, body in zip(parts[::2], parts[1::2], strict=True)}
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_says_what_every_flag_is_for(tut: Callable[..., Said], verb: str) -> None:
     said = tut(verb, "--help")
     assert (said.code, said.err) == (0, "")
-    text = re.sub(r"[│╭╰─╮╯]", " ", said.out)
-    parts = re.split(r"^ *(--?[a-z][\w.-]*)(?=[ ,])", text, flags=re.MULTILINE)[1:]
-    found = {name: " ".join(body.split()) for name, body in zip(parts[::2], parts[1::2], strict=True)}
+    found = described(said.out)
     for name, body in found.items():
-        described = re.sub(r"^(, --[\w-]+)*( ?(\{[^}]*\}\|?)?[A-Z\[\] .]*)", "", body).split("(default:")[0]
-        assert described.strip() or re.match(r"INT [NM]\. ", body), (name, body)
+        text = re.sub(r"^(, --[\w-]+)*( ?(\{[^}]*\}\|?)?[A-Z\[\] .]*)", "", body)
+        assert re.split(r"\(default:|\(optional\)", text)[0].strip() or re.match(r"INT [NM]\. ", body), (name, body)
     expected = {"run": flags(RunConfig), "train-expert": flags(ExpertConfig)}.get(verb, set())
     assert expected <= set(found), expected - set(found)
+
+
+def commands(verbs: Mapping[str, Any], *before: str) -> Iterator[tuple[str, ...]]:
+    """Every command, with those of groups."""
+    for name, verb in verbs.items():
+        if isinstance(verb, ModuleType):
+            yield from commands(verb.VERBS, *before, name)
+        else:
+            yield *before, name
+
+
+@pytest.mark.parametrize("command", [*commands(dict.fromkeys(VERBS) | cli.LIGHT)], ids=" ".join)
+def test_no_help_shows_a_default_that_is_none_or_nothing(tut: Callable[..., Said], command: tuple[str, ...]) -> None:
+    said = tut(*command, "--help")
+    assert (said.code, said.err) == (0, "")
+    assert said.out.startswith("usage: tutelage " + " ".join(command))
+    assert "None" not in said.out
+    assert not [name for name, body in described(said.out).items() if "(default: )" in body]
+
+
+def test_an_option_that_may_be_left_out_says_so_and_what_happens_then(tut: Callable[..., Said]) -> None:
+    run, report = described(tut("run", "--help").out), described(tut("report", "--help").out)
+    assert run["--thresholds.risk"] == "FLOAT r-hat, likewise; default: from `risk_quantile`, or from `missed`. (optional)"
+    assert run["--threads"].endswith("default: one a core. (optional)")
+    assert run["--robots"] == "INT N. (default: 100)"
+    assert report["--out"].endswith("in the folder that holds them all. (optional)")
 
 
 def test_help_of_the_whole_lists_the_verbs_with_a_line_each(tut: Callable[..., Said]) -> None:
@@ -274,6 +305,7 @@ def refused(said: Said) -> str:
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
+        (["run", "Walker2d", "--threads", "None"], "Error parsing --threads: "),
         (["run", "Walker2d", "--learner.schedule", "weekly"], "--learner.schedule"),
         (["info", "bogus"], "Expected one of ('tasks', 'levels', 'priorities', 'version')"),
         (["check", "robot", "x"], "Expected one of ('env', 'policy', 'priority', 'supervisor', 'driver')"),

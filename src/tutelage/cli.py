@@ -35,6 +35,12 @@ if TYPE_CHECKING:
     from tutelage.fleet.loop import Loop
     from tutelage.fleet.step import Subscriber
 
+LIGHT = {
+    "keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top,
+    "serve": serve, "accounts": accounts, "audit": audit, "study": study, "robot": robot, "fleet": remote,
+}  # fmt: skip
+"""The verbs that do without the learning libraries, or load them when they run."""
+
 console = Console(markup=False, width=None if sys.stdout.isatty() else 200)
 """Without markup, as names of folders may contain brackets; wide where there is no terminal, so that lines stay lines."""
 
@@ -202,9 +208,9 @@ def check(
 
     Args:
         kind: what it is.
-        name: module:callable that makes it; an env is made as callable(num_envs), the others without arguments. For
-            env also the name of a task, for priority also a string such as C.U.R., for driver all that `tutelage robot`
-            takes. A driver's robot moves!
+        name: module:callable that makes it; an env is made as callable(num_envs), a priority gets `thresholds` if it takes
+            them, the others are made without arguments. For env also the name of a task, for priority also a string such as
+            C.U.R., for driver all that `tutelage robot` takes. A driver's robot moves!
         task: the fleet on which policies, priorities and supervisors are tried.
     """
     if kind == "driver":
@@ -365,10 +371,7 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # so that module:callable finds a file of the user's in the present folder
     try:
-        # These do without the learning libraries, or load them when they run.
-        light = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
-        light |= {"serve": serve, "accounts": accounts, "audit": audit, "study": study, "robot": robot, "fleet": remote}
-        verbs = light if arguments[:1] and arguments[0] in light else _learning_verbs() | light
+        verbs = LIGHT if arguments[:1] and arguments[0] in LIGHT else _learning_verbs() | LIGHT
         parse_verb(verbs, arguments)()
         sys.stdout.flush()
     except TutelageError as error:

@@ -57,13 +57,14 @@ class PriorityConfig:
     """Numbers of the priority functions (table C.1). Thresholds given as a quantile are resolved before the run.
 
     Attributes:
-        uncertainty: u-hat, uncertainty at or below it counts as 0; None: from `uncertainty_quantile`.
-        risk: r-hat, likewise; None: from `risk_quantile`.
+        uncertainty: u-hat, uncertainty at or below it counts as 0; default: from `uncertainty_quantile`.
+        risk: r-hat, likewise; default: from `risk_quantile`, or from `missed`.
         uncertainty_quantile: quantile of the uncertainty over the policy's own first steps that becomes u-hat.
         risk_quantile: likewise for r-hat.
         missed: in place of `risk_quantile`: fraction of falls of the cloned policy that may come without its risk having
-            been above r-hat in the 10 timesteps before (a conformal bound, on average over calibrations).
-        initial: t_I, timesteps at the start during which constraint violations have no priority; None: what the
+            been above r-hat in the 10 timesteps before (a conformal bound, on average over calibrations); default: no such
+            promise.
+        initial: t_I, timesteps at the start during which constraint violations have no priority; default: what the
             task and the priority decide (only C.U.R. has such a period).
         combined: threshold of the combined score of U.G.
         goal_weight: weight of the goal term in the combined score of U.G.
