@@ -32,7 +32,7 @@ def load_object(name: str, what: str) -> Callable[..., Any]:
     return found  # type: ignore[no-any-return]
 
 
-def make_object(name: str, what: str, **offered: Any) -> Any:
+def make_object(name: str, what: str, /, **offered: Any) -> Any:
     """What the callable that "module:callable" names returns, called without arguments but those offered that it takes.
 
     Raises:
@@ -54,7 +54,7 @@ def takes(make: Callable[..., Any], argument: str) -> bool:
     return any(p.kind is p.VAR_KEYWORD or (p.name == argument and p.kind in by_name) for p in parameters)
 
 
-def check_call(make: Callable[..., Any], name: str, *arguments: Any, **settings: Any) -> None:
+def check_call(make: Callable[..., Any], name: str, /, *arguments: Any, **settings: Any) -> None:
     """Refuse arguments that a callable does not take, before it runs, so that its own TypeErrors stay its own.
 
     Raises:

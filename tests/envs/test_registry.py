@@ -88,6 +88,7 @@ def test_tasks_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
         ("math:nothing", {}, ConfigError, "has no callable 'nothing'"),
         ("math:pi", {}, ConfigError, "has no callable 'pi'"),
         ("{here}:points", {"speed": 3}, ConfigError, "unexpected keyword argument 'speed'"),
+        ("{here}:points", {"name": "x"}, ConfigError, "unexpected keyword argument 'name'"),
         ("{here}:points", {"disturbance": "mild"}, ConfigError, "unexpected keyword argument 'disturbance'"),
         ("Walker2d", {"gravity": 3}, ConfigError, "unexpected keyword argument 'gravity'"),
         ("{here}:nobody", {"threads": 2}, ConfigError, "task '.*:nobody' cannot be made: too many positional arguments"),
