@@ -15,6 +15,8 @@ from fakes import POSITION, PointFleet
 from gymnasium.vector.utils import batch_space
 
 from tutelage.experiments.config import RunConfig
+from tutelage.fleet.priority import PriorityConfig
+from tutelage.fleet.view import FleetView
 from tutelage.learning.critic import CriticConfig
 from tutelage.learning.imitation import LearnerConfig
 from tutelage.store import load_tree
@@ -90,6 +92,27 @@ class Reaching:
 
     def act(self, obs: Any) -> Any:
         return np.clip(5 * (0.25 - obs[:, [POSITION]]), -1, 1).astype(np.float32)
+
+
+class Worry:
+    """A priority of the user's own, with a critic, a threshold and a memory: who fell, then who was at risk so far."""
+
+    needs = ("risk",)
+
+    def __init__(self, thresholds: PriorityConfig) -> None:
+        self.limit = thresholds.risk or 0.0
+        self.worry = np.zeros(0)
+
+    def __call__(self, view: FleetView) -> Any:
+        past = self.worry if len(self.worry) else np.zeros(view.num_robots)
+        self.worry = 0.9 * past + np.where(view.risk > self.limit, view.risk, 0.0)
+        return np.stack([view.violation, np.where(view.violation, 0.0, self.worry)], axis=1)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"worry": self.worry.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.worry = state["worry"].copy()
 
 
 class GoalFleet(PointFleet):

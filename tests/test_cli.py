@@ -9,13 +9,14 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from small import FLAGS, assert_same, points, walker
+from small import FLAGS, Worry, assert_same, points, walker
 
 import tutelage
 from tutelage import cli
@@ -102,6 +103,21 @@ def test_a_run_with_a_fleet_of_ones_own(tut: Callable[..., Said], tmp_path: Path
     assert said.out == f"{tmp_path / 'run'} is complete at timestep 30; nothing to do\n"
 
 
+def test_a_run_with_threads_for_a_fleet_that_takes_none(tut: Callable[..., Said], tmp_path: Path) -> None:
+    said = tut("run", "small:point_fleet", *POINTS, "--threads", 2, "--out", tmp_path / "run")
+    assert (said.code, said.err) == (0, "")
+
+
+def test_a_run_with_a_priority_of_ones_own(tut: Callable[..., Said], tmp_path: Path) -> None:
+    said = tut("run", "small:point_fleet", *POINTS, "--priority", "small:Worry", "--out", tmp_path / "run")
+    assert (said.code, said.err) == (0, "")
+    assert "small:Worry  30/30" in said.out
+    said = tut("evaluate", tmp_path / "run", "--steps", 20, "--priority", "small:Worry")
+    assert (said.code, said.err) == (0, "")
+    pytest.importorskip("matplotlib")
+    assert "small:Worry" in tut("report", tmp_path / "run").out
+
+
 def test_evaluate(tut: Callable[..., Said], folder: Path) -> None:
     said = tut("evaluate", folder, "--steps", 20)
     assert (said.code, said.err) == (0, "")
@@ -171,6 +187,10 @@ class Undecided:
     """Neither a policy nor a supervisor."""
 
 
+class Curious(Worry):
+    needs = ("risk", "gossip")  # type: ignore[assignment]
+
+
 class Teacher:
     def act(self, obs: Any, robots: Any) -> Any:
         return np.zeros((len(obs), 6), dtype=np.float32)
@@ -186,6 +206,7 @@ class Standing:
     [
         ("env", "Walker2d", "Walker2d keeps the contract of an env\n"),
         ("priority", "C.U.R.", "C.U.R. keeps the contract of a priority\n"),
+        ("priority", "small:Worry", "small:Worry keeps the contract of a priority\n"),
         ("policy", "test_cli:Standing", "test_cli:Standing keeps the contract of a policy\n"),
         ("supervisor", "test_cli:Teacher", "test_cli:Teacher keeps the contract of a supervisor\n"),
     ],
@@ -209,18 +230,48 @@ def flags(cls: Any, prefix: str = "") -> set[str]:
     return names
 
 
+def described(out: str) -> dict[str, str]:
+    """What help says of each option, on one line."""
+    parts = re.split(r"^ *(--?[a-z][\w.-]*)(?=[ ,])", re.sub(r"[│╭╰─╮╯]", " ", out), flags=re.MULTILINE)[1:]
+    return {name: " ".join(body.split()) for name, body in zip(parts[::2], parts[1::2], strict=True)}
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_says_what_every_flag_is_for(tut: Callable[..., Said], verb: str) -> None:
     said = tut(verb, "--help")
     assert (said.code, said.err) == (0, "")
-    text = re.sub(r"[│╭╰─╮╯]", " ", said.out)
-    parts = re.split(r"^ *(--?[a-z][\w.-]*)(?=[ ,])", text, flags=re.MULTILINE)[1:]
-    found = {name: " ".join(body.split()) for name, body in zip(parts[::2], parts[1::2], strict=True)}
+    found = described(said.out)
     for name, body in found.items():
-        described = re.sub(r"^(, --[\w-]+)*( ?(\{[^}]*\}\|?)?[A-Z\[\] .]*)", "", body).split("(default:")[0]
-        assert described.strip() or re.match(r"INT [NM]\. ", body), (name, body)
+        text = re.sub(r"^(, --[\w-]+)*( ?(\{[^}]*\}\|?)?[A-Z\[\] .]*)", "", body)
+        assert re.split(r"\(default:|\(optional\)", text)[0].strip() or re.match(r"INT [NM]\. ", body), (name, body)
     expected = {"run": flags(RunConfig), "train-expert": flags(ExpertConfig)}.get(verb, set())
     assert expected <= set(found), expected - set(found)
+
+
+def commands(verbs: Mapping[str, Any], *before: str) -> Iterator[tuple[str, ...]]:
+    """Every command, with those of groups."""
+    for name, verb in verbs.items():
+        if isinstance(verb, ModuleType):
+            yield from commands(verb.VERBS, *before, name)
+        else:
+            yield *before, name
+
+
+@pytest.mark.parametrize("command", [*commands(dict.fromkeys(VERBS) | cli.LIGHT)], ids=" ".join)
+def test_no_help_shows_a_default_that_is_none_or_nothing(tut: Callable[..., Said], command: tuple[str, ...]) -> None:
+    said = tut(*command, "--help")
+    assert (said.code, said.err) == (0, "")
+    assert said.out.startswith("usage: tutelage " + " ".join(command))
+    assert "None" not in said.out
+    assert not [name for name, body in described(said.out).items() if "(default: )" in body]
+
+
+def test_an_option_that_may_be_left_out_says_so_and_what_happens_then(tut: Callable[..., Said]) -> None:
+    run, report = described(tut("run", "--help").out), described(tut("report", "--help").out)
+    assert run["--thresholds.risk"] == "FLOAT r-hat, likewise; default: from `risk_quantile`, or from `missed`. (optional)"
+    assert run["--threads"].endswith("default: one a core. (optional)")
+    assert run["--robots"] == "INT N. (default: 100)"
+    assert report["--out"].endswith("in the folder that holds them all. (optional)")
 
 
 def test_help_of_the_whole_lists_the_verbs_with_a_line_each(tut: Callable[..., Said]) -> None:
@@ -254,6 +305,7 @@ def refused(said: Said) -> str:
         (["run"], "name of a task (see `tutelage info tasks`)"),
         (["resume"], "the run folder. (required)"),
         (["run", "Walker2d", "--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
+        (["run", "Walker2d", "--threads", "None"], "Error parsing --threads: "),
         (["run", "Walker2d", "--learner.schedule", "weekly"], "--learner.schedule"),
         (["info", "bogus"], "Expected one of ('tasks', 'levels', 'priorities', 'version')"),
         (["check", "robot", "x"], "Expected one of ('env', 'policy', 'priority', 'supervisor', 'driver')"),
@@ -355,6 +407,20 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["check", "policy", "test_cli"], "policy 'test_cli': module 'test_cli' has no callable ''"),
         (["check", "policy", "test_cli:Undecided"], "Undecided is no policy; it needs act(obs)"),
         (["check", "supervisor", "test_cli:Undecided"], "Undecided is no supervisor; it needs act(obs, robots)"),
+        (
+            ["run", "Walker2d", "--priority", "nowhere:Mine"],
+            "priority 'nowhere:Mine': no module 'nowhere'; install it, or run where Python finds it",
+        ),
+        (["run", "Walker2d", "--priority", "small:Mine"], "priority 'small:Mine': module 'small' has no callable 'Mine'"),
+        (["run", "Walker2d", "--priority", "small:FLAGS"], "priority 'small:FLAGS': module 'small' has no callable 'FLAGS'"),
+        (["run", "Walker2d", "--priority", "test_cli:Standing"], "priority 'test_cli:Standing' must return a priority, *"),
+        (
+            ["run", "Walker2d", "--priority", "test_cli:Curious"],
+            "test_cli:Curious needs the signal gossip, and a run has uncertainty, risk, goal, predicted_discrepancy and "
+            "judgement; others go into a Loop of yours",
+        ),
+        (["check", "priority", "test_cli:Undecided"], "priority 'test_cli:Undecided' must return a priority, *"),
+        (["check", "policy", "small:point_fleet"], "policy 'small:point_fleet' cannot be made: missing a required *"),
         (["check", "priority", "Z."], "cannot read the priority 'Z.': use different terms of *"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -35,6 +35,12 @@ if TYPE_CHECKING:
     from tutelage.fleet.loop import Loop
     from tutelage.fleet.step import Subscriber
 
+LIGHT = {
+    "keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top,
+    "serve": serve, "accounts": accounts, "audit": audit, "study": study, "robot": robot, "fleet": remote,
+}  # fmt: skip
+"""The verbs that do without the learning libraries, or load them when they run."""
+
 console = Console(markup=False, width=None if sys.stdout.isatty() else 200)
 """Without markup, as names of folders may contain brackets; wide where there is no terminal, so that lines stay lines."""
 
@@ -92,7 +98,8 @@ def evaluate(
     Args:
         folder: the run folder whose policy is evaluated.
         steps: timesteps.
-        priority: who gets help: "C." gives hard resets only, "U.C." also teleoperation of uncertain robots.
+        priority: who gets help: "C." gives hard resets only, "U.C." also teleoperation of uncertain robots; or
+            module:callable, a priority of yours.
         expert: evaluate the algorithmic supervisor itself, for reference.
     """
     from tutelage.experiments.evaluate import evaluate_run
@@ -201,9 +208,9 @@ def check(
 
     Args:
         kind: what it is.
-        name: module:callable that makes it; an env is made as callable(num_envs), the others without arguments. For
-            env also the name of a task, for priority also a string such as C.U.R., for driver all that `tutelage robot`
-            takes. A driver's robot moves!
+        name: module:callable that makes it; an env is made as callable(num_envs), a priority gets `thresholds` if it takes
+            them, the others are made without arguments. For env also the name of a task, for priority also a string such as
+            C.U.R., for driver all that `tutelage robot` takes. A driver's robot moves!
         task: the fleet on which policies, priorities and supervisors are tried.
     """
     if kind == "driver":
@@ -213,18 +220,19 @@ def check(
         console.print(f"{name} keeps the contract of a driver", highlight=False)
         return
     from tutelage import checks
-    from tutelage.envs.registry import load_object, make_fleet
-    from tutelage.fleet.priority import parse
+    from tutelage.envs.registry import make_fleet
+    from tutelage.fleet.priority import own_priority, parse
+    from tutelage.objects import make_object
 
     fleet = make_fleet(name if kind == "env" else task, 4)
     if kind == "env":
         checks.check_env(fleet)
     elif kind == "priority":
-        checks.check_priority(load_object(name, kind)() if ":" in name else parse(name), fleet)
+        checks.check_priority(own_priority(name) if ":" in name else parse(name), fleet)
     elif kind == "policy":
-        checks.check_policy(load_object(name, kind)(), fleet)
+        checks.check_policy(make_object(name, kind), fleet)
     else:
-        checks.check_supervisor(load_object(name, kind)(), fleet)
+        checks.check_supervisor(make_object(name, kind), fleet)
     fleet.close()
     console.print(f"{name} keeps the contract of {'an' if kind == 'env' else 'a'} {kind}", highlight=False)
 
@@ -363,10 +371,7 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # so that module:callable finds a file of the user's in the present folder
     try:
-        # These do without the learning libraries, or load them when they run.
-        light = {"keys": keys, "router": router, "proxy": proxy, "ping": ping, "top": top}
-        light |= {"serve": serve, "accounts": accounts, "audit": audit, "study": study, "robot": robot, "fleet": remote}
-        verbs = light if arguments[:1] and arguments[0] in light else _learning_verbs() | light
+        verbs = LIGHT if arguments[:1] and arguments[0] in LIGHT else _learning_verbs() | LIGHT
         parse_verb(verbs, arguments)()
         sys.stdout.flush()
     except TutelageError as error:

@@ -1,20 +1,55 @@
-"""From the arguments of a command to the function that does it: tyro's parser, its complaints as one line."""
+"""From the arguments of a command to the function that does it: tyro's parser, its complaints as one line.
+
+An option whose default is None or nothing at all may be left out: help says "(optional)", and its text what happens then.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import difflib
 import functools
+import inspect
 import io
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
 import tyro
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from tutelage.errors import ConfigError
+
+OPTIONAL = tyro.conf.arg(help_behavior_hint="(optional)")
+
+
+class _Options(ConstructorRegistry):
+    """tyro's rules, with fields of configurations that may be left out."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._asking = False
+        self.struct_rule(self._rule)
+
+    def _rule(self, info: StructTypeInfo) -> StructConstructorSpec | None:
+        if self._asking or not dataclasses.is_dataclass(info.type):
+            return None
+        self._asking = True  # what tyro's own rules say
+        try:
+            spec = self.get_struct_spec(info)
+        finally:
+            self._asking = False
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        fields = (dataclasses.replace(field, type=_optional(field.type, field.default)) for field in spec.fields)
+        return dataclasses.replace(spec, fields=tuple(fields))
+
+
+def _optional(kind: Any, default: Any) -> Any:
+    """The annotation of an option; one that may be left out says so, where tyro would show the default None."""
+    return Annotated[kind, OPTIONAL] if default is None or default == () else kind
 
 
 def parse_verb(
@@ -48,6 +83,12 @@ def parse_verb(
         def call(*args: Any, **kwargs: Any) -> Callable[[], None]:
             return functools.partial(verb, *args, **kwargs)
 
+        del call.__wrapped__  # else the verb's own annotations would count
+        signature, hints = inspect.signature(verb), get_type_hints(verb, include_extras=True)
+        call.__signature__ = signature  # type: ignore[attr-defined]
+        call.__annotations__ = {
+            name: _optional(hints[name], parameter.default) for name, parameter in signature.parameters.items()
+        }
         return call
 
     said = io.StringIO()
@@ -58,6 +99,8 @@ def parse_verb(
                 prog=prog,
                 args=arguments,
                 description=description,
+                config=(tyro.conf.DisallowNone,),
+                registry=_Options(),
             )
         return chosen
     except SystemExit as stop:

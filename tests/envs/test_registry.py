@@ -25,7 +25,19 @@ def points(num_envs: int, *, bound: float = 1.0) -> PointFleet:
     return PointFleet(num_envs, bound=bound)
 
 
+def threaded(num_envs: int, *, threads: int = 1) -> PointFleet:
+    return PointFleet(num_envs, bound=float(threads))
+
+
+def anything(num_envs: int, **settings: Any) -> PointFleet:
+    return PointFleet(num_envs, bound=float(settings["threads"]))
+
+
 def nothing(num_envs: int) -> None:
+    return None
+
+
+def nobody() -> None:
     return None
 
 
@@ -41,6 +53,13 @@ def test_a_function_of_a_module() -> None:
     fleet = make_fleet(f"{__name__}:points", 4, bound=2.0)
     assert isinstance(fleet, PointFleet)
     assert (fleet.num_envs, fleet.bound) == (4, 2.0)
+
+
+@pytest.mark.parametrize(("name", "bound"), [("points", 1.0), ("threaded", 3.0), ("anything", 3.0)])
+def test_a_function_gets_threads_only_if_it_takes_them(name: str, bound: float) -> None:
+    fleet = make_fleet(f"{__name__}:{name}", 2, threads=3)
+    assert isinstance(fleet, PointFleet)
+    assert fleet.bound == bound
 
 
 def test_a_task_class_of_a_module_takes_what_a_built_in_one_takes() -> None:
@@ -69,8 +88,10 @@ def test_tasks_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
         ("math:nothing", {}, ConfigError, "has no callable 'nothing'"),
         ("math:pi", {}, ConfigError, "has no callable 'pi'"),
         ("{here}:points", {"speed": 3}, ConfigError, "unexpected keyword argument 'speed'"),
+        ("{here}:points", {"name": "x"}, ConfigError, "unexpected keyword argument 'name'"),
         ("{here}:points", {"disturbance": "mild"}, ConfigError, "unexpected keyword argument 'disturbance'"),
         ("Walker2d", {"gravity": 3}, ConfigError, "unexpected keyword argument 'gravity'"),
+        ("{here}:nobody", {"threads": 2}, ConfigError, "task '.*:nobody' cannot be made: too many positional arguments"),
         ("{here}:nothing", {}, ContractError, "must return a tutelage.fleet.fleet.Fleet, got NoneType"),
     ],
 )

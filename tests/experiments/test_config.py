@@ -46,6 +46,7 @@ def test_settings_that_cannot_work_are_refused(changes: dict[str, Any], message:
 def test_the_folder_is_named_after_task_priority_and_seed() -> None:
     assert RunConfig("Walker2d", seed=3).folder == Path("runs/Walker2d-C.U.R-s3")
     assert RunConfig("my.robots:make", priority="C.").folder == Path("runs/my.robots.make-C-s0")
+    assert RunConfig("Walker2d", priority="my.ideas:Mine").folder == Path("runs/Walker2d-my.ideas.Mine-s0")
     assert RunConfig("Walker2d", out=Path("here")).folder == Path("here")
 
 

@@ -13,9 +13,10 @@ from small import contents, points, walker
 
 from tutelage.errors import ConfigError, RunFolderError, TutelageError
 from tutelage.experiments.evaluate import evaluate_policy, evaluate_run
-from tutelage.experiments.run import Run
+from tutelage.experiments.run import Run, loop_state, read_config
 from tutelage.fleet.gates import GateConfig
 from tutelage.fleet.priority import PriorityConfig
+from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.policies.expert import GaussianActor
 
 pytest.importorskip("mujoco")
@@ -63,6 +64,18 @@ def test_help_is_given_when_the_priority_asks_for_it(folder: Path) -> None:
 
 def test_help_by_what_the_run_has_learned(folder: Path) -> None:
     assert evaluate_run(folder, 40, "C.U.R.")["teleoperation"] > 0
+
+
+def test_help_by_a_priority_of_ones_own(folder: Path, tmp_path: Path) -> None:
+    config = read_config(folder)
+    curious = dataclasses.replace(config, steps=40, thresholds=dataclasses.replace(config.thresholds, risk=-1.0))
+    policy, learned = EnsemblePolicy.load(folder / "policy.safetensors")[0], loop_state(folder)
+    result = evaluate_policy(curious, policy, "small:Worry", learned=learned)
+    assert result["teleoperation"] > 0, "with the critic of C.U.R., and a low threshold"
+    run = Run.start(points(tmp_path / "run", priority="C."))
+    run.run()
+    with pytest.raises(ConfigError, match="this run did not learn risk, which small:Worry looks at"):
+        evaluate_run(run.folder, 40, "small:Worry")
 
 
 def test_execution_mode_is_a_gate_without_learning_and_without_noise(tmp_path: Path) -> None:

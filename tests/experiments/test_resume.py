@@ -75,6 +75,16 @@ def test_a_run_of_thrifty_dagger_keeps_its_running_moments(tmp_path: Path) -> No
     assert_same(tmp_path / "whole", tmp_path / "killed")
 
 
+def test_a_run_with_a_priority_of_ones_own_keeps_what_that_remembers(tmp_path: Path) -> None:
+    whole = Run.start(points(tmp_path / "whole", priority="small:Worry"))
+    assert list(whole.assembly.learner.critics) == ["risk"], "it needs this one"
+    assert whole.run()["teleoperation"] > 0
+    killed(die_after, points(tmp_path / "killed", priority="small:Worry"), 17)
+    assert json.loads((tmp_path / "killed" / "config.json").read_text())["priority"] == "small:Worry"
+    assert resume(tmp_path / "killed") == 10
+    assert_same(tmp_path / "whole", tmp_path / "killed")
+
+
 # -- killed at the worst moments of a save --------------------------------------------------------------------------
 
 

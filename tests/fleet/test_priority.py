@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.random import default_rng
 
 from tutelage.errors import ConfigError, ContractError
-from tutelage.fleet.priority import Priority, PriorityConfig, parse
+from tutelage.fleet.priority import Priority, PriorityConfig, own_priority, parse
 
 FALLEN = (True, False, False, False)
 CONFIG = PriorityConfig(uncertainty=0.3, risk=0.5, initial=10, random=0.5)
@@ -104,6 +104,92 @@ def test_impossible_numbers_are_refused(wrong) -> None:
 def test_the_threshold_of_random_is_a_probability(threshold) -> None:
     with pytest.raises(ConfigError, match="between 0 and 1"):
         parse("Random.", PriorityConfig(random=threshold))
+
+
+# -- of the user's own ----------------------------------------------------------------------------------------------
+
+
+class Recent:
+    """Whoever a human has been with for the fewest timesteps, and robots in violation before them."""
+
+    def __init__(self, thresholds: PriorityConfig | None = None, *, scale: float = 1.0) -> None:
+        self.thresholds, self.scale, self.calls = thresholds, scale, 0
+
+    def __call__(self, view):
+        self.calls += 1
+        return np.stack([view.violation, self.scale / (1.0 + view.duration)], axis=1)
+
+    def state_dict(self):
+        return {"calls": self.calls}
+
+    def load_state_dict(self, state):
+        self.calls = state["calls"]
+
+
+class Mute(Recent):
+    def __call__(self, view):
+        return [0.0] * view.num_robots
+
+
+class Flat(Recent):
+    def __call__(self, view):
+        return view.violation
+
+
+def recent() -> Recent:
+    return Recent(scale=2.0)
+
+
+def demanding(scale: float) -> Recent:
+    return Recent(scale=scale)
+
+
+def just_a_class() -> type:
+    return Recent
+
+
+def nothing() -> None:
+    return None
+
+
+def test_a_priority_of_ones_own_gives_the_ranks_and_keeps_its_state() -> None:
+    priority = parse(f"{__name__}:recent")
+    assert isinstance(priority, Priority)
+    assert priority.needs == set()
+    seen = view(violation=FALLEN)
+    np.testing.assert_array_equal(priority(seen), recent()(seen))
+    again = parse(f"{__name__}:recent")
+    again.load_state_dict(priority.state_dict())
+    assert again.state_dict() == priority.state_dict() == {"0": {"calls": 1}}
+
+
+def test_a_priority_of_ones_own_gets_the_thresholds_if_it_takes_them() -> None:
+    assert own_priority(f"{__name__}:Recent", CONFIG).thresholds is CONFIG  # type: ignore[attr-defined]
+    assert own_priority(f"{__name__}:Recent").thresholds == PriorityConfig()  # type: ignore[attr-defined]
+    assert own_priority(f"{__name__}:recent", CONFIG).thresholds is None  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("no_such_module:P", ConfigError, "priority 'no_such_module:P': no module 'no_such_module'"),
+        ("math:P", ConfigError, "module 'math' has no callable 'P'"),
+        ("math:pi", ConfigError, "module 'math' has no callable 'pi'"),
+        (":P", ConfigError, "write module:callable"),
+        ("{here}:demanding", ConfigError, "cannot be made: missing a required argument: 'scale'"),
+        ("{here}:nothing", ContractError, "must return a priority, .* got NoneType"),
+        ("{here}:just_a_class", ContractError, "must return a priority, .* got type"),
+    ],
+)
+def test_a_priority_of_ones_own_that_cannot_be_made_is_named(name, error, message) -> None:
+    with pytest.raises(error, match=message):
+        parse(name.replace("{here}", __name__))
+
+
+@pytest.mark.parametrize(("name", "found"), [("Mute", "list"), ("Flat", r"\(4,\)")])
+def test_a_priority_of_ones_own_must_return_a_row_for_each_robot(name, found) -> None:
+    with pytest.raises(ContractError, match=rf"priority '.*:{name}' must return an array \(4, K\), got {found}"):
+        parse(f"{__name__}:{name}")(view(violation=FALLEN))
 
 
 # -- U.G. -----------------------------------------------------------------------------------------------------------

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import importlib
-import inspect
 import re
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
@@ -15,6 +13,7 @@ from tutelage.envs.tasks import TASKS
 from tutelage.envs.tasks.base import Task
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet
+from tutelage.objects import check_call, load_object, takes
 
 EXTRAS = {
     "robosuite": {"NutAssemblyRound": "tutelage.envs.robosuite_fleet:NutAssemblyRound"},
@@ -51,8 +50,9 @@ def make_fleet(
             of the group "tutelage.tasks", or "module:callable". The callable is a subclass of `Task`, or is called as
             `callable(num_envs, **kwargs)` and returns a `Fleet`.
         num_envs: N robots.
-        disturbance: for the built-in tasks, see `TaskFleet`. Handed to a callable only when given, like `threads`.
-        threads: physics threads.
+        disturbance: for the built-in tasks, see `TaskFleet`. Handed to a callable only when given.
+        threads: physics threads, on which no result depends. Handed to a callable only when given, and only to one
+            that takes it.
         kwargs: further arguments of the fleet, such as `success_return`.
 
     Raises:
@@ -64,9 +64,11 @@ def make_fleet(
     make: Any = find_task(task)
     if isinstance(make, type) and issubclass(make, Task):
         kind = make.fleet_type()
-        _fits(kind, task, make, num_envs, settings=settings)
+        check_call(kind, f"task {task!r}", make, num_envs, **settings)
         return kind(make(), num_envs, **settings)
-    _fits(make, task, num_envs, settings=settings)
+    if not takes(make, "threads"):
+        settings.pop("threads", None)
+    check_call(make, f"task {task!r}", num_envs, **settings)
     fleet = make(num_envs, **settings)
     if not isinstance(fleet, Fleet):
         raise ContractError(f"task {task!r} must return a tutelage.fleet.fleet.Fleet, got {type(fleet).__name__}")
@@ -100,35 +102,3 @@ def find_task(task: str) -> Callable[..., Any]:
 
 def _installed() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=GROUP)}
-
-
-def load_object(name: str, what: str) -> Callable[..., Any]:
-    """The callable that "module:callable" names. `what` says in errors what it is for ("task").
-
-    Raises:
-        ConfigError: no such module, or no such callable in it.
-    """
-    module, _, attribute = name.partition(":")
-    try:
-        found: Any = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module exists, and something that it imports does not
-        raise ConfigError(f"{what} {name!r}: no module {error.name!r}; install it, or run where Python finds it") from None
-    except ValueError:  # an empty or relative name
-        raise ConfigError(f"{what} {name!r}: write module:callable, such as my_package.robots:make_fleet") from None
-    for part in attribute.split("."):
-        found = getattr(found, part, None)
-    if not callable(found):
-        raise ConfigError(f"{what} {name!r}: module {module!r} has no callable {attribute!r}")
-    return found  # type: ignore[no-any-return]
-
-
-def _fits(make: Callable[..., Any], task: str, *arguments: Any, settings: dict[str, Any]) -> None:
-    """Refuse settings that the callable does not take, before it runs, so that its own TypeErrors stay its own."""
-    try:
-        inspect.signature(make).bind(*arguments, **settings)
-    except TypeError as error:
-        raise ConfigError(f"task {task!r} cannot be made with {sorted(settings)}: {error}") from None
-    except ValueError:  # a callable without a signature, such as one written in C
-        return

@@ -82,6 +82,11 @@ class Assembly:
         for name, make in (("team", self.team), ("signals", self.signals)):
             if name not in parts:
                 parts[name] = make()
+        if unknown := sorted(priority.needs - {"uncertainty", *parts["signals"]}):
+            known = "uncertainty, risk, goal, predicted_discrepancy and judgement"
+            raise ConfigError(
+                f"{c.priority} needs the signal {', '.join(unknown)}, and a run has {known}; others go into a Loop of yours"
+            )
         return Loop(**parts)
 
     def team(self) -> Team:

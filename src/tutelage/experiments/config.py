@@ -31,7 +31,8 @@ class RunConfig:
 
     Attributes:
         task: name of a task (see `tutelage info tasks`), or "module:function" that makes a fleet.
-        priority: p-hat, such as C.U.R., U.C., U.G.C., C., Random.
+        priority: p-hat, such as C.U.R., U.C., U.G.C., C., Random (see `tutelage info priorities`); or "module:callable" that
+            makes one.
         robots: N.
         humans: M.
         steps: T, timesteps of the run.
@@ -130,7 +131,7 @@ class RunConfig:
     def folder(self) -> Path:
         """Where the run is kept."""
         task = self.task.replace(":", ".").replace("/", ".") + ("-images" if self.observation == "images" else "")
-        return self.out or Path("runs") / f"{task}-{self.priority.rstrip('.')}-s{self.seed}"
+        return self.out or Path("runs") / f"{task}-{self.priority.replace(':', '.').rstrip('.')}-s{self.seed}"
 
     @property
     def algorithm(self) -> str:

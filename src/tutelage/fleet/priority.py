@@ -10,6 +10,7 @@ for which all terms are 0 asks for nobody. Every algorithm and ablation of chapt
     C.U.R.  Constraint-Uncertainty-Risk
 
 The gates of chapters 2 and 3 are terms too, by name. "LazyDAgger" alone is "LazyDAgger.C.": who asks, then who fell.
+"module:callable" is a priority of the user's own.
 """
 
 from __future__ import annotations
@@ -25,13 +26,18 @@ from numpy.typing import NDArray
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.gates import GATES, GateConfig
 from tutelage.fleet.view import FleetView
+from tutelage.objects import make_object
 
 Array = NDArray[Any]
 
 
 @runtime_checkable
 class Priority(Protocol):
-    """p-hat: how much each robot needs a human."""
+    """p-hat: how much each robot needs a human.
+
+    One that looks at signals names them in an attribute `needs`, a tuple: a run makes critics for "risk" and "goal" only
+    if they are named there.
+    """
 
     def __call__(self, view: FleetView) -> Array:
         """(N, K) float64, compared lexicographically; all K <= 0: needs nobody."""
@@ -51,13 +57,14 @@ class PriorityConfig:
     """Numbers of the priority functions (table C.1). Thresholds given as a quantile are resolved before the run.
 
     Attributes:
-        uncertainty: u-hat, uncertainty at or below it counts as 0; None: from `uncertainty_quantile`.
-        risk: r-hat, likewise; None: from `risk_quantile`.
+        uncertainty: u-hat, uncertainty at or below it counts as 0; default: from `uncertainty_quantile`.
+        risk: r-hat, likewise; default: from `risk_quantile`, or from `missed`.
         uncertainty_quantile: quantile of the uncertainty over the policy's own first steps that becomes u-hat.
         risk_quantile: likewise for r-hat.
         missed: in place of `risk_quantile`: fraction of falls of the cloned policy that may come without its risk having
-            been above r-hat in the 10 timesteps before (a conformal bound, on average over calibrations).
-        initial: t_I, timesteps at the start during which constraint violations have no priority; None: what the
+            been above r-hat in the 10 timesteps before (a conformal bound, on average over calibrations); default: no such
+            promise.
+        initial: t_I, timesteps at the start during which constraint violations have no priority; default: what the
             task and the priority decide (only C.U.R. has such a period).
         combined: threshold of the combined score of U.G.
         goal_weight: weight of the goal term in the combined score of U.G.
@@ -185,6 +192,34 @@ class UncertaintyGoal:
         self.count, self.mean, self.m2 = state["count"], state["mean"].copy(), state["m2"].copy()
 
 
+class Own:
+    """A priority of the user's own as the only term: its columns are those of the whole.
+
+    Args:
+        name: "module:callable", for errors.
+        priority: what the callable made.
+    """
+
+    def __init__(self, name: str, priority: Priority) -> None:
+        self.name, self.priority = name, priority
+        self.needs: tuple[str, ...] = tuple(getattr(priority, "needs", ()))
+
+    def __call__(self, view: FleetView) -> Array:
+        ranks = self.priority(view)
+        if not isinstance(ranks, np.ndarray) or ranks.ndim != 2 or len(ranks) != view.num_robots or not ranks.shape[1]:
+            found = ranks.shape if isinstance(ranks, np.ndarray) else type(ranks).__name__
+            raise ContractError(f"priority {self.name!r} must return an array ({view.num_robots}, K), got {found}")
+        return ranks
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the priority remembers."""
+        return self.priority.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.priority.load_state_dict(state)
+
+
 TERMS: dict[str, Any] = {"C": Constraint, "U": Uncertainty, "R": Risk, "G": Goal, "Random": Random}
 
 
@@ -223,7 +258,7 @@ def parse(text: str, config: PriorityConfig | None = None, gate: GateConfig | No
     """The priority that a string such as "C.U.R." or "LazyDAgger" names. Neighbours "U.G." become one combined term.
 
     Args:
-        text: terms with dots between them; a gate alone is followed by "C".
+        text: terms with dots between them; a gate alone is followed by "C". Or "module:callable", see `own_priority`.
         config: numbers of the terms.
         gate: numbers of the gates.
 
@@ -231,6 +266,8 @@ def parse(text: str, config: PriorityConfig | None = None, gate: GateConfig | No
         ConfigError: an unknown or repeated term.
     """
     config, gate = config or PriorityConfig(), gate or GateConfig()
+    if ":" in text:
+        return Lexicographic(text, [Own(text, own_priority(text, config))])
     if gate.doubt is None:
         gate = dataclasses.replace(gate, doubt=config.uncertainty)
     names = [part for part in text.split(".") if part]
@@ -238,8 +275,7 @@ def parse(text: str, config: PriorityConfig | None = None, gate: GateConfig | No
     if not names or unknown or len(set(names)) < len(names):
         raise ConfigError(
             f"cannot read the priority {text!r}: use different terms of {', '.join(TERMS)} with dots, such as C.U.R., "
-            f"or one of {', '.join(GATES)}"
-            + ("; a callable of yours goes into a Loop (docs/extending.md)" if ":" in text else "")
+            f"or one of {', '.join(GATES)}, or your own as module:callable"
         )
     if len(names) == 1 and names[0] in GATES:
         names.append("C")
@@ -252,3 +288,19 @@ def parse(text: str, config: PriorityConfig | None = None, gate: GateConfig | No
             name = names.pop(0)
             terms.append(GATES[name](gate) if name in GATES else TERMS[name](config))
     return Lexicographic(text, terms)
+
+
+def own_priority(name: str, config: PriorityConfig | None = None) -> Priority:
+    """The priority that "module:callable" makes. The callable gets `thresholds`, a `PriorityConfig`, if it takes them.
+
+    Before a run is prepared, thresholds that are found by quantiles are None.
+
+    Raises:
+        ConfigError: no such callable, or it needs other arguments.
+        ContractError: it does not make a priority.
+    """
+    priority = make_object(name, "priority", thresholds=config or PriorityConfig())
+    if isinstance(priority, type) or not isinstance(priority, Priority):
+        wanted = "a priority, which is called with a view and has state_dict and load_state_dict"
+        raise ContractError(f"priority {name!r} must return {wanted}, got {type(priority).__name__}")
+    return priority

@@ -64,7 +64,10 @@ class FleetView:
         if name not in self.computed:
             if name not in self.signals:
                 known = ", ".join(sorted(self.signals)) or "none"
-                raise ConfigError(f"this run has no signal {name!r} (it has: {known}); choose a priority without it")
+                raise ConfigError(
+                    f"this run has no signal {name!r} (it has: {known}); choose a priority without it, or name it in the "
+                    "`needs` of yours"
+                )
             value = np.asarray(self.signals[name](self), dtype=np.float64)
             if value.shape != (self.num_robots,):
                 raise ContractError(f"signal {name!r} must have shape ({self.num_robots},), got {value.shape}")

@@ -49,9 +49,9 @@ def robot(
         camera_hz: pictures of a camera in a second, at most.
         size: of pictures that a task of ours draws, width and height.
         quality: of the pictures' JPEG, 1 to 100.
-        seed: of the first episode.
+        seed: of the first episode; default: any.
         policy: decide on the robot, with weights that the server hands out; the server overrides.
-        health: HOST:PORT at which to serve /healthz and /metrics.
+        health: HOST:PORT at which to serve /healthz and /metrics; default: they are not served.
     """
     from tutelage.remote.driver import make_driver
     from tutelage.remote.robot import DriverFailed, Robot, RobotConfig

@@ -21,9 +21,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.envs.registry import find_task, load_object, make_fleet, task_names
+from tutelage.envs.registry import find_task, make_fleet, task_names
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet
+from tutelage.objects import make_object
 from tutelage.remote.messages import MAX_CAMERAS, Description, Malformed
 from tutelage.remote.simulated import FleetDriver, GymnasiumDriver
 
@@ -84,7 +85,7 @@ def make_driver(name: str, *, render: bool = True, size: tuple[int, int] = (320,
         ConfigError: nothing of that name, or it makes something else.
     """
     if ":" in name:
-        made = load_object(name, "robot")()
+        made = make_object(name, "robot")
         if isinstance(made, gym.Env):
             return GymnasiumDriver(made)
         if isinstance(made, Fleet):
@@ -94,12 +95,10 @@ def make_driver(name: str, *, render: bool = True, size: tuple[int, int] = (320,
             raise ConfigError(f"robot {name!r} must make {wanted}, a Gymnasium environment or a fleet of one")
         return made
     if name in task_names():
-        make: Any = find_task(name)
-        settings: dict[str, Any] = {"threads": 1} if isinstance(make, type) else {}
         if render:
             with contextlib.suppress(ConfigError):
-                return FleetDriver(make_fleet(name, 1, render_mode="rgb_array", **settings), name, *size)
-        return FleetDriver(make_fleet(name, 1, **settings), name, *size)
+                return FleetDriver(make_fleet(name, 1, threads=1, render_mode="rgb_array"), name, *size)
+        return FleetDriver(make_fleet(name, 1, threads=1), name, *size)
     try:
         gym.spec(name)
     except gym.error.Error:

@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from tutelage.envs.registry import ON_EXTRAS, find_task, load_object, make_fleet
+from tutelage.envs.registry import ON_EXTRAS, find_task, make_fleet
 from tutelage.envs.rollout import rollout
 from tutelage.envs.task_fleet import TaskFleet
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.policy import Policy
+from tutelage.objects import make_object
 from tutelage.policies.expert import GaussianActor
 from tutelage.seeding import derive
 
@@ -101,7 +102,7 @@ def run_program(name: str) -> Policy:
         ConfigError: no such callable.
         ContractError: it does not make a policy.
     """
-    policy = load_object(name, "expert")()
+    policy = make_object(name, "expert")
     if not isinstance(policy, Policy):
         raise ContractError(f"expert {name!r} must return a policy with act(obs), got {type(policy).__name__}")
     return policy

@@ -24,22 +24,22 @@ class GateConfig:
     """Numbers of the gates. Discrepancies are fractions of the largest possible one; see `discrepancy`.
 
     Attributes:
-        beta_h: beta_H of SafeDAgger and LazyDAgger: an action discrepancy at or above it is unsafe; None: the one that
+        beta_h: beta_H of SafeDAgger and LazyDAgger: an action discrepancy at or above it is unsafe; default: the one that
             marks `unsafe` of the offline data.
         unsafe: fraction of the offline data that counts as unsafe (0.2: Zhang and Cho; section 2.6).
         beta_r: beta_R of LazyDAgger, as a fraction of beta_H (table A.1: 1/10 or 1/2). Below 1.
         ask_again: give control back by the classifier alone, LazyDAgger (-Switch to Auto).
         noise: sigma^2 that LazyDAgger injects into the human's actions, in units of half the action range; 0: (-Noise).
         alpha: alpha_h of ThriftyDAgger: the desired fraction of timesteps with a request. In (0, 1).
-        alpha_end: alpha_h after `alpha_over` timesteps, reached in a straight line from alpha; None: alpha_h stays.
+        alpha_end: alpha_h after `alpha_over` timesteps, reached in a straight line from alpha; default: alpha_h stays.
         alpha_over: how long that takes.
-        without: a signal that ThriftyDAgger is to do without, "novelty" or "risk" (its two ablations).
-        novelty: delta_h with which ThriftyDAgger begins; None: from the first steps of the cloned policy.
+        without: a signal that ThriftyDAgger is to do without, "novelty" or "risk" (its two ablations); default: none.
+        novelty: delta_h with which ThriftyDAgger begins; default: from the first steps of the cloned policy.
         risk_ask: likewise beta_H.
         risk_cede: likewise beta_R.
-        mean_discrepancy: likewise delta_r; None: from the offline data.
+        mean_discrepancy: likewise delta_r; default: from the offline data.
         history: timesteps of robots seen before ThriftyDAgger recomputes its thresholds.
-        doubt: chi of EnsembleDAgger: uncertainty above it asks; None: like u-hat of the thresholds.
+        doubt: chi of EnsembleDAgger: uncertainty above it asks; default: like u-hat of the thresholds.
         reaction: timesteps that HG-DAgger's human needs to make up their mind, either way.
         span: robots that one human can watch at a time in HG-DAgger.
         dwell: timesteps that they look at the same robots.
