@@ -133,9 +133,16 @@ def highest(ranks: Array, k: int, exclude: Array, rng: np.random.Generator) -> A
         tied = tied[np.flatnonzero(values == cut)]
     if len(tied) > k:
         tied = rng.choice(tied, k, replace=False)
-    best = np.concatenate([*chosen, tied])
-    order = np.lexsort([rng.random(len(best)), *(column[best] for column in reversed(columns))])
-    return np.asarray(best[order[::-1]])
+    chosen.append(tied)
+    lots, drawn = rng.random(sum(map(len, chosen))), 0
+    ordered = [np.empty(0, dtype=np.int64)]
+    for c, robots in enumerate(chosen):  # column c decided about them, as they are equal in the columns before
+        if len(robots):
+            robots = robots[np.argsort(lots[drawn : drawn + len(robots)])]
+            drawn += len(robots)
+            keys = [column[robots] for column in reversed(columns[c:])]
+            ordered.append((robots[np.lexsort(keys)] if keys else robots)[::-1])
+    return np.concatenate(ordered)
 
 
 def _reach(values: Array, k: int) -> float:
