@@ -52,17 +52,16 @@ class Pictured(SmallSupervision):
             return [push for _, other, _, _, _, push in self.commands if push is not None and other == robot]
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
-
-
 @pytest.fixture(scope="module", params=list(PLACES))
-def running(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    server = Running(tmp_path_factory.mktemp("page"), lambda audit: Pictured(audit, request.param))
-    yield server
-    server.close()
+def work(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Person, Pictured]]:
+    """Somebody at such robots."""
+    with chromium() as browser:
+        server = Running(tmp_path_factory.mktemp("page"), lambda audit: Pictured(audit, request.param))
+        try:
+            with person(browser, server.origin, "ana") as ana:
+                yield ana, server.supervision
+        finally:
+            server.close()
 
 
 def middle(somebody: Person, colour: Any) -> tuple[float, float]:
@@ -78,28 +77,29 @@ def middle(somebody: Person, colour: Any) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("robot", range(len(SHAPES) + 1))
-def test_a_drag_arrives_as_it_was_made(browser: Any, running: Running, robot: int) -> None:
-    supervision = running.supervision
+def test_a_drag_arrives_as_it_was_made(work: tuple[Person, Pictured], robot: int) -> None:
+    ana, supervision = work
     task, pointer = supervision.description.task, supervision.description.controls.pointer
-    places, *colours = PLACES[task]
-    with person(browser, running.origin, "ana") as ana:
-        ana.go(f"/robot/{robot}")
-        ana.page.get_by_role("button", name="Take over").last.click()
-        ana.see(".stage-mine .view-pointer")
-        height, width = supervision.pictures[robot].shape[:2]
-        until(lambda: ana.page.evaluate("document.querySelector('.view canvas').width") == width, "the picture")
-        (x0, y0), (x1, y1) = (middle(ana, colour) for colour in colours)
-        ana.page.mouse.move(x0, y0)
-        ana.page.mouse.down()
-        ana.page.mouse.move((x0 + x1) / 2, y0, steps=3)
-        ana.page.mouse.move(x1, y1, steps=3)
-        ana.see(".arrow line")
-        if pointer.kind == "go":  # it goes on arriving for as long as the button is down
-            before = len(supervision.pushes(robot))
-            until(lambda: len(supervision.pushes(robot)) > before + 2, "commands")
-        ana.page.mouse.up()
-        until(lambda: supervision.pushes(robot), "a command")
-        pixel = max(pointer.view.width / width, pointer.view.height / height)
-        assert supervision.pushes(robot)[-1] == pytest.approx(places, abs=pixel)
-        ana.page.keyboard.press("g")
-        ana.page.wait_for_selector(".stage-mine", state="detached")
+    assert pointer is not None
+    (height, width), (places, *colours) = supervision.pictures[robot].shape[:2], PLACES[task]
+    ana.go(f"/robot/{robot}")
+    ana.see("h1", f"point-{robot}")
+    ana.page.get_by_role("button", name="Take over").click()
+    ana.see(".stage-mine .view-pointer")
+    shape = "(({width, height}) => [width, height])(document.querySelector('.view canvas'))"
+    until(lambda: ana.page.evaluate(shape) == [width, height], "the picture")
+    (x0, y0), (x1, y1) = (middle(ana, colour) for colour in colours)
+    ana.page.mouse.move(x0, y0)
+    ana.page.mouse.down()
+    ana.page.mouse.move((x0 + x1) / 2, y0, steps=3)
+    ana.page.mouse.move(x1, y1, steps=3)
+    ana.see(".arrow line")
+    if pointer.kind == "go":  # it goes on arriving for as long as the button is down
+        before = len(supervision.pushes(robot))
+        until(lambda: len(supervision.pushes(robot)) > before + 2, "commands")
+    ana.page.mouse.up()
+    until(lambda: supervision.pushes(robot), "a command")
+    pixel = max(pointer.view.width / width, pointer.view.height / height)
+    assert supervision.pushes(robot)[-1] == pytest.approx(places, abs=pixel)
+    ana.page.keyboard.press("g")
+    ana.page.wait_for_selector(".stage-mine", state="detached")
