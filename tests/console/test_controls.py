@@ -49,9 +49,7 @@ def test_a_drag_pushes_the_block_that_way() -> None:
     drive, (fleet, obs) = driver("ObstaclePushing")
     block = fleet.states[0, :2].copy()
     away = block / np.linalg.norm(block)  # off the obstacle
-    x, y = 0.02 * away
-    width = 2 * 0.16 * 16 / 9  # of the picture, m
-    action = drive.action(None, (0.5, 0.5, 0.5 + x / width, 0.5 - y / (2 * 0.16)), obs[0], 0)
+    action = drive.action(None, (0.01, -0.03, *(0.02 * away + [0.01, -0.03])), obs[0], 0)
     assert action == pytest.approx(0.02 * away / 0.03, abs=1e-3)
     fleet.step(action[None])
     moved = fleet.states[0, :2] - block
@@ -60,7 +58,7 @@ def test_a_drag_pushes_the_block_that_way() -> None:
 
 def test_a_long_drag_is_a_push_of_full_length_in_its_direction() -> None:
     drive, (_, obs) = driver("ObstaclePushing")
-    action = drive.action(None, (0.1, 0.5, 0.9, 0.6), obs[0], 0)
+    action = drive.action(None, (-0.12, 0.0, 0.12, -0.03), obs[0], 0)
     assert action is not None
     assert np.abs(action).max() == pytest.approx(1.0)
     assert action[1] < 0 < action[0]
@@ -68,7 +66,7 @@ def test_a_long_drag_is_a_push_of_full_length_in_its_direction() -> None:
 
 @pytest.mark.parametrize(
     ("drag", "face"),
-    [((0.5, 0.5, 0.6, 0.5), 0), ((0.5, 0.5, 0.5, 0.3), 1), ((0.5, 0.5, 0.4, 0.5), 2), ((0.5, 0.5, 0.5, 0.7), 3)],
+    [((0.0, 0.0, 0.05, 0.0), 0), ((0.0, 0.0, 0.0, 0.1), 1), ((0.0, 0.0, -0.05, 0.01), 2), ((0.0, 0.0, 0.02, -0.1), 3)],
 )
 def test_of_four_pushes_the_nearest_to_the_drag(drag: tuple[float, ...], face: int) -> None:
     drive, (fleet, obs) = driver("BlockPushing")
@@ -85,37 +83,35 @@ def test_no_key_and_no_drag_is_no_push() -> None:
     drive, (_, obs) = driver("BlockPushing")
     assert drive.controls.once
     assert drive.action(np.zeros(4), None, obs[0], 0) is None
-    assert drive.action(None, (0.5, 0.5, 0.5, 0.5), obs[0], 0) is None
+    assert drive.action(None, (0.1, 0.1, 0.1, 0.1), obs[0], 0) is None
 
 
 def test_a_robot_in_the_maze_goes_to_where_one_points() -> None:
     drive, (fleet, obs) = driver("Navigation")
     target = np.array([12.0, 27.0])
-    x, y = (target[0] + 0.5) / 100, (60.5 - target[1]) / 61
     for _ in range(8):
-        action = drive.action(None, (0.0, 0.0, x, y), obs[0], 0)
+        action = drive.action(None, (0.0, 0.0, *target), obs[0], 0)
         obs, *_ = fleet.step(action[None])
     assert obs[0] == pytest.approx(target)
 
 
-def test_the_picture_of_the_maze_agrees() -> None:
-    """Where the robot is drawn is where one has to point at it."""
-    drive, (fleet, obs) = driver("Navigation")
-    picture = fleet.render_robot(0, 320, 180).astype(int)
-    rows, columns = np.nonzero(np.abs(picture - [214, 70, 50]).sum(axis=2) < 10)
-    x, y = (columns.mean() + 0.5) / 320, (rows.mean() + 0.5) / 180
-    action = drive.action(None, (x, y, x, y), obs[0], 0)
-    assert action == pytest.approx([0.0, 0.0], abs=0.5)
-
-
-def test_the_picture_of_the_table_agrees() -> None:
-    drive, (fleet, _) = driver("ObstaclePushing")
-    picture = fleet.render_robot(0, 320, 180).astype(int)
-    rows, columns = np.nonzero(np.abs(picture - [40, 80, 200]).sum(axis=2) < 10)
+@pytest.mark.parametrize(("width", "height"), [(320, 180), (320, 240), (200, 200), (180, 320)])
+@pytest.mark.parametrize(("task", "colour"), [("Navigation", (214, 70, 50)), ("ObstaclePushing", (40, 80, 200))])
+def test_a_picture_of_any_shape_shows_the_view_whole_and_not_stretched(
+    task: str, colour: tuple[int, int, int], width: int, height: int
+) -> None:
+    """In its middle and as large as it fits: from that the page knows where on the plane people point."""
+    drive, (fleet, _) = driver(task)
     pointer = drive.controls.pointer
     assert pointer is not None
-    there = np.array(pointer.world) @ [(columns.mean() + 0.5) / 320, (rows.mean() + 0.5) / 180, 1.0]
-    assert there == pytest.approx(fleet.states[0, :2], abs=0.004)
+    view = pointer.view
+    found = np.abs(fleet.render_robot(0, width, height).astype(int) - colour).sum(axis=2) < 10
+    rows, columns = np.nonzero(found)
+    pixel = max(view.width / width, view.height / height)
+    x = view.x + (columns.mean() + 0.5 - width / 2) * pixel
+    y = view.y - (rows.mean() + 0.5 - height / 2) * pixel
+    assert [x, y] == pytest.approx(fleet.states[0, :2], abs=pixel)
+    assert abs(np.ptp(rows) - np.ptp(columns)) <= 1, "as wide as high"
 
 
 @pytest.mark.parametrize("push", [[0.1] * 3, "push", [0.1, 0.2, 0.3, float("nan")], [9.0, 0.0, 0.0, 0.0], [None] * 4])

@@ -10,7 +10,9 @@ const RENEW = 200; // ms; the server holds a robot after 500 ms without a sign o
 const SWITCH = 400; // ms that a switch is repeated for: a gripper needs time to close
 const SOONEST = 15; // ms between two commands, however fast people press
 
-export type Drag = { from: [number, number]; to: [number, number] };
+/** Where somebody points: in the picture (0..1 from the top left), and on the task's plane. */
+export type Spot = { picture: [number, number]; plane: [number, number] };
+export type Drag = { from: Spot; to: Spot };
 
 /** What is pressed now, for the page to show. */
 export const held = signal<{ values: number[]; assist: boolean; drag: Drag | null }>({ values: [], assist: false, drag: null });
@@ -77,8 +79,8 @@ export function drop(): void {
   const done = drag;
   drag = null;
   if (done && kind && kind !== "go") {
-    const far = Math.hypot(done.to[0] - done.from[0], done.to[1] - done.from[1]);
-    if (far > 0.01) command(null, false, [...done.from, ...done.to]);
+    const far = Math.hypot(done.to.picture[0] - done.from.picture[0], done.to.picture[1] - done.from.picture[1]);
+    if (far > 0.01) command(null, false, [...done.from.plane, ...done.to.plane]);
   }
   tick(true);
 }
@@ -133,7 +135,7 @@ function tick(changed = false): void {
   const pressed = watching() && (going || assist || switching || anythingPressed(which, state));
   if (pressed) {
     if (assist) command(null, true, null);
-    else if (going && drag) command(null, false, [...drag.from, ...drag.to]);
+    else if (going && drag) command(null, false, [...drag.from.plane, ...drag.to.plane]);
     else if (!which.once || !wasPressed) command(actionOf(which, state), false, null); // a push is one move, however long the key is down
   } else if (wasPressed && !which.once) {
     command(null, false, null); // nothing is pressed any more: the robot holds at once, not when the last command is stale

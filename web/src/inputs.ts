@@ -1,6 +1,6 @@
 /** From keys, gamepad and touch to an action. Pure: what is pressed goes in, numbers come out. */
 
-import type { Axis, Controls } from "./protocol";
+import type { Axis, Controls, Plane } from "./protocol";
 
 export interface Pad {
   axes: readonly number[];
@@ -122,4 +122,10 @@ export function fitted(box: Box, width: number, height: number): Box {
 export function normalised(x: number, y: number, picture: Box): [number, number] {
   const clip = (value: number): number => Math.min(1, Math.max(0, value));
   return [clip((x - picture.left) / picture.width), clip((y - picture.top) / picture.height)];
+}
+
+/** Where on the task's plane a point of a picture is (0..1 from the top left) that shows `view` and is width x height pixels. */
+export function onPlane([x, y]: [number, number], width: number, height: number, view: Plane): [number, number] {
+  const scale = Math.min(width / view.width, height / view.height); // as the server draws
+  return [view.x + ((x - 0.5) * width) / scale, view.y - ((y - 0.5) * height) / scale];
 }

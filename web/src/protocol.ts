@@ -20,11 +20,19 @@ export interface Axis {
   toggle?: boolean;
 }
 
+/** A part of the task's plane: its middle and its sides. +y is up. */
+export interface Plane {
+  x: number;
+  y: number;
+  width: number;
+  height: number;
+}
+
 export interface Pointer {
   kind: "push" | "go" | "pick_place";
   camera: number;
-  /** width / height of the picture in which the server measures. */
-  aspect?: number;
+  /** What a picture shows: whole, in the middle, as large as it fits. */
+  view: Plane;
 }
 
 export interface Controls {

@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { actionOf, anythingPressed, assistKey, deadZone, deflections, driveKeys, fitted, normalised, padValue, scale, switchesOf, type Inputs } from "../src/inputs";
+import { actionOf, anythingPressed, assistKey, deadZone, deflections, driveKeys, fitted, normalised, onPlane, padValue, scale, switchesOf, type Inputs } from "../src/inputs";
 import type { Controls } from "../src/protocol";
 
 const controls: Controls = {
@@ -67,5 +67,19 @@ describe("the pointer", () => {
     expect(picture).toEqual({ left: 0, top: 87.5, width: 400, height: 225 });
     expect(normalised(200, 200, picture)).toEqual([0.5, 0.5]);
     expect(normalised(500, 0, picture)).toEqual([1, 0]);
+  });
+  it("means the same place on the plane whatever the shape of the picture", () => {
+    const table = { x: 0, y: 0, width: 0.32, height: 0.32 };
+    for (const [width, height] of [[320, 180], [320, 240], [240, 240], [180, 320]] as const) {
+      const pixel = 0.32 / Math.min(width, height);
+      expect(onPlane([0.5, 0.5], width, height, table)).toEqual([0, 0]);
+      const [x, y] = onPlane([0.5 + 30 / width, 0.5 + 40 / height], width, height, table);
+      expect([x / pixel, y / pixel]).toEqual([expect.closeTo(30, 9), expect.closeTo(-40, 9)]);
+    }
+  });
+  it("means the corners of the plane at those of a picture of its shape", () => {
+    const maze = { x: 49.5, y: 30, width: 100, height: 61 };
+    expect(onPlane([0, 0], 200, 122, maze)).toEqual([-0.5, 60.5]);
+    expect(onPlane([1, 1], 200, 122, maze)).toEqual([99.5, -0.5]);
   });
 });

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,12 @@ from tutelage.fleet.policy import Policy
 from tutelage.fleet.supervisor import PolicySupervisor
 from tutelage.policies.kinds import kinds_of
 
+if TYPE_CHECKING:
+    from tutelage.envs.tasks.base import View
+
 Array = NDArray[Any]
-WIDE = 16 / 9
-"""Width / height of the pictures that people point at."""
+FAR = 10.0
+"""How far from the middle of a view people may point, in its longer side: pictures may show more than the view."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +54,13 @@ class Pointer:
         kind: "push": the drag is the way that something is to move, once; "go": the robot goes to where the pointer is, as
             long as it is pressed.
         camera: in which picture.
-        aspect: width / height of the picture for which `world` holds.
-        world: (2, 3), from (x, y, 1) of a picture, 0 to 1 from the top left, to the task's coordinates.
+        view: which part of the task's plane such a picture shows. The page knows the picture, so it says where on the plane
+            people point.
     """
 
     kind: str
     camera: int
-    aspect: float
-    world: tuple[tuple[float, float, float], tuple[float, float, float]]
+    view: View
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class Driver:
         return np.clip(numbers, self._low, self._high).astype(np.float32)
 
     def check_push(self, push: Any) -> tuple[float, float, float, float] | None:
-        """A drag from outside: from (x, y) to (x, y), each 0 to 1.
+        """A drag from outside: from (x, y) to (x, y), on the task's plane.
 
         Raises:
             Denied: bad_command.
@@ -128,9 +130,11 @@ class Driver:
             return None
         if self.controls.pointer is None:
             raise Denied("bad_command", "the pointer means nothing at this task")
-        numbers = _numbers(push, 4)
-        if numbers is None or (numbers < -0.5).any() or (numbers > 1.5).any():
-            raise Denied("bad_command", "a push is 4 numbers from 0 to 1")
+        numbers, view = _numbers(push, 4), self.controls.pointer.view
+        if numbers is None:
+            raise Denied("bad_command", "a push is 4 finite numbers")
+        if np.abs(numbers.reshape(2, 2) - (view.x, view.y)).max() > FAR * max(view.width, view.height):
+            raise Denied("bad_command", "a push begins and ends in the picture")
         x0, y0, x1, y1 = numbers.tolist()
         return x0, y0, x1, y1
 
@@ -153,8 +157,7 @@ class Driver:
         return actions
 
     def _pushed(self, pointer: Pointer, push: Sequence[float], obs: Array) -> Array | None:
-        world = np.array(pointer.world)
-        start, end = (world @ np.array([x, y, 1.0]) for x, y in (push[:2], push[2:]))
+        start, end = np.array(push).reshape(2, 2)
         if pointer.kind == "go":
             return np.asarray(np.clip(end - obs[:2], self._low, self._high), dtype=np.float32)
         way = end - start
@@ -211,32 +214,28 @@ def _axis(index: int, label: str, pair: int) -> Axis:
 
 
 def _navigation(assist: bool) -> Controls:
-    from tutelage.envs.tasks.navigation import SIZE
+    from tutelage.envs.tasks.navigation import VIEW
 
-    wide, high = SIZE
-    world = ((float(wide), 0.0, -0.5), (0.0, -float(high), high - 0.5))  # as `Navigation.draw` does; +y is up
     axes = (_axis(0, "right", 0), _axis(1, "up", 1))
-    return Controls(axes, Pointer("go", 0, WIDE, world), assist, help="arrows steer; or press where the robot is to go")
-
-
-def _view() -> Pointer:
-    """Pushing is seen from above, in the middle of a picture that is wider than the table."""
-    from tutelage.envs.tasks.block_pushing import WALL
-
-    view = WALL + 0.01
-    return Pointer("push", 0, WIDE, ((2 * view * WIDE, 0.0, -view * WIDE), (0.0, -2 * view, view)))
+    return Controls(axes, Pointer("go", 0, VIEW), assist, help="arrows steer; or press where the robot is to go")
 
 
 def _block_pushing(assist: bool) -> Controls:
+    from tutelage.envs.tasks.block_pushing import VIEW
+
     faces = (("right", "ArrowRight", "button15"), ("up", "ArrowUp", "button12"),
              ("left", "ArrowLeft", "button14"), ("down", "ArrowDown", "button13"))  # fmt: skip
     axes = tuple(Axis(k, label, 0.0, 1.0, ("", key), pad) for k, (label, key, pad) in enumerate(faces))
-    return Controls(axes, _view(), assist, once=True, help="arrows push the block by 3 cm; or drag on the picture")
+    help = "arrows push the block by 3 cm; or drag on the picture"
+    return Controls(axes, Pointer("push", 0, VIEW), assist, once=True, help=help)
 
 
 def _obstacle_pushing(assist: bool) -> Controls:
+    from tutelage.envs.tasks.block_pushing import VIEW
+
     axes = (_axis(0, "right", 0), _axis(1, "up", 1))
-    return Controls(axes, _view(), assist, once=True, help="drag the way the block is to go, at most 3 cm; or arrows")
+    help = "drag the way the block is to go, at most 3 cm; or arrows"
+    return Controls(axes, Pointer("push", 0, VIEW), assist, once=True, help=help)
 
 
 def _peg_insertion(assist: bool) -> Controls:

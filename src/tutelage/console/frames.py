@@ -39,7 +39,7 @@ class Painter(Protocol):
         ...
 
     def draw(self, state: Array, width: int, height: int) -> Picture:
-        """A robot in such a state (S,), (height, width, 3) uint8; always in the same thread."""
+        """A robot in such a state (S,), (at most height, at most width, 3) uint8; always in the same thread."""
         ...
 
     def close(self) -> None:
@@ -132,15 +132,12 @@ class OwnPainter:
 
 
 def fitted(picture: Picture, width: int, height: int) -> Picture:
-    """A picture within width x height, as large as it fits, on grey."""
+    """A picture as large as it fits in width x height, with its shape kept."""
     high, wide = picture.shape[:2]
     scale = min(width / wide, height / high)
     w, h = max(1, int(wide * scale)), max(1, int(high * scale))
     rows, columns = (np.arange(h) / scale).astype(int), (np.arange(w) / scale).astype(int)
-    whole = np.full((height, width, 3), 40, dtype=np.uint8)
-    y, x = (height - h) // 2, (width - w) // 2
-    whole[y : y + h, x : x + w] = picture[np.ix_(rows.clip(max=high - 1), columns.clip(max=wide - 1))]
-    return whole
+    return picture[np.ix_(rows.clip(max=high - 1), columns.clip(max=wide - 1))]
 
 
 def painter_of(fleet: Fleet) -> Painter | None:

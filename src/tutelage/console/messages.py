@@ -58,7 +58,7 @@ class Stop(Message):
 
 
 class Command(Message):
-    """What a robot is to do. sent: the page's clock, ms; push: (x0, y0, x1, y1) in the picture, 0 to 1."""
+    """What a robot is to do. sent: the page's clock, ms; push: (x0, y0, x1, y1) on the task's plane."""
 
     type: Literal["command"]
     robot: Robot

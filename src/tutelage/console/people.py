@@ -37,7 +37,7 @@ class Command:
         lease: under which it came.
         action: (A,) within bounds, or None.
         assist: the algorithmic human acts for the person.
-        push: a drag on the picture, or None.
+        push: a drag, (x0, y0, x1, y1) on the task's plane, or None.
         uses: timesteps that executed it.
     """
 

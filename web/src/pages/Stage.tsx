@@ -3,9 +3,9 @@
 import { signal, useComputed, type Signal } from "@preact/signals";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { get } from "../api";
-import { dragTo, drop, giveBackKey, held, letGo, resetKey, sending } from "../drive";
+import { dragTo, drop, giveBackKey, held, letGo, resetKey, sending, type Spot } from "../drive";
 import { clock, duration, keyLabel, milliseconds, plural } from "../format";
-import { fitted, normalised } from "../inputs";
+import { fitted, normalised, onPlane } from "../inputs";
 import { giveBack, hardReset, handOver, takeOver } from "../live";
 import { LOOK_TEXT, Mode as ModeNumber, reasonText } from "../modes";
 import { confirmDialog } from "../parts/Dialog";
@@ -114,12 +114,14 @@ export function View({ frame, index, camera, stats, mine }: { frame: { current: 
     const captured = stats.value.captured;
     return captured === null ? null : store.now.value + store.clockSync.offset - captured;
   });
-  const at = (event: PointerEvent): [number, number] => {
-    const box = (event.currentTarget as HTMLElement).getBoundingClientRect();
-    const { width, height } = stats.value.width ? stats.value : { width: 16, height: 9 };
-    return normalised(event.clientX, event.clientY, fitted(box, width, height));
+  const at = (event: PointerEvent): Spot | null => {
+    const box = frame.current?.querySelector(".picture")?.getBoundingClientRect();
+    const { width, height } = stats.value;
+    if (!box || !pointer || !width) return null; // there is no picture yet
+    const picture = normalised(event.clientX, event.clientY, fitted(box, width, height));
+    return { picture, plane: onPlane(picture, width, height, pointer.view) };
   };
-  const start = useRef<[number, number] | null>(null);
+  const start = useRef<Spot | null>(null);
   const listeners = usable
     ? {
         onTouchStart: noGesture,
@@ -129,10 +131,11 @@ export function View({ frame, index, camera, stats, mine }: { frame: { current: 
           frame.current?.focus();
           (event.currentTarget as HTMLElement).setPointerCapture(event.pointerId);
           start.current = at(event);
-          dragTo({ from: start.current, to: start.current });
+          if (start.current) dragTo({ from: start.current, to: start.current });
         },
         onPointerMove: (event: PointerEvent) => {
-          if (start.current) dragTo({ from: start.current, to: at(event) });
+          const to = at(event);
+          if (start.current && to) dragTo({ from: start.current, to });
         },
         onPointerUp: () => {
           if (start.current) drop();
@@ -160,7 +163,7 @@ export function View({ frame, index, camera, stats, mine }: { frame: { current: 
       ) : (
         <Picture robot={index} camera={camera} fps={20} priority={2} label={`Live picture of ${name}`} stats={stats} />
       )}
-      {usable && drag ? <Arrow from={drag.from} to={drag.to} width={stats.value.width || 16} height={stats.value.height || 9} /> : null}
+      {usable && drag ? <Arrow from={drag.from.picture} to={drag.to.picture} width={stats.value.width} height={stats.value.height} /> : null}
       {tooOld && old.value !== null ? <p class="view-note">Picture is {duration(old.value)} old</p> : null}
       {old.value === null ? <p class="view-note">Waiting for a picture…</p> : null}
       <Progress index={index} />

@@ -64,6 +64,31 @@ class World:
     wind: float
 
 
+@dataclass(frozen=True)
+class View:
+    """The part of a task's plane that pictures of any shape show: whole, in their middle, as large as it fits.
+
+    Attributes:
+        x, y: its middle, in the plane's unit. +x is to the right in the picture, +y is up.
+        width, height: its sides, in the plane's unit.
+    """
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    def scale(self, width: int, height: int) -> float:
+        """Pixels for a unit of the plane, along x as along y, in a picture of so many pixels."""
+        return min(width / self.width, height / self.height)
+
+    def points(self, width: int, height: int) -> tuple[Array, Array]:
+        """Where a picture's pixels are on the plane: the x of its columns (width,), the y of its rows (height,)."""
+        scale = self.scale(width, height)
+        x = self.x + (np.arange(width) + 0.5 - width / 2) / scale
+        return x, self.y - (np.arange(height) + 0.5 - height / 2) / scale
+
+
 class ArrayTask(Task):
     """A task with a goal whose physics is written as array operations. Stateless: everything is in the state (N, S) float64.
 

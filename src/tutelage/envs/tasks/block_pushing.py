@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.envs.tasks.base import Array, ArrayTask, World
+from tutelage.envs.tasks.base import Array, ArrayTask, View, World
 
 HALF = 0.02
 """Half of the block's side, m."""
@@ -37,8 +37,8 @@ TABLE, BORDER, BLOCK, GOAL, STONE = np.array(
     [[214, 186, 146], [120, 92, 62], [40, 80, 200], [70, 170, 80], [70, 70, 74]], dtype=np.uint8
 )
 """Colours: wood, its border, the cube, the goal, the obstacle."""
-_VIEW = WALL + 0.01
-"""What the camera sees to each side of the middle, m."""
+VIEW = View(0.0, 0.0, 2 * (WALL + 0.01), 2 * (WALL + 0.01))
+"""What the camera sees: the table, m."""
 
 
 class _Pushing(ArrayTask):
@@ -85,14 +85,14 @@ class _Pushing(ArrayTask):
     def draw(self, state: Array, width: int, height: int) -> NDArray[np.uint8]:
         from tutelage.envs.raster import paint
 
-        scale = min(width, height) / (2 * _VIEW)
+        scale = VIEW.scale(width, height)
         x, y, angle, goal_x, goal_y = state.T
         shapes = np.zeros((len(state), 3, 4))
         shapes[:, 0, :3] = np.stack([goal_x, goal_y, np.full_like(x, GOAL_RADIUS)], axis=1)
         shapes[:, 1, 2] = self.obstacle
         shapes[:, 2] = np.stack([x, y, np.full_like(x, HALF), angle], axis=1)
         shapes[:, :, :3] *= scale
-        shapes[:, :, 0] += width / 2
+        shapes[:, :, 0] += width / 2  # the middle of the table is that of the picture
         shapes[:, :, 1] = height / 2 - shapes[:, :, 1]  # y and angles are counted upwards
         shapes[:, :, 3] *= -1
         discs, colours = np.array([True, False, False]), np.stack([GOAL, STONE, BLOCK])
@@ -203,8 +203,6 @@ def _opposite(blocks: Array) -> Array:
 @functools.lru_cache(16)
 def _background(width: int, height: int) -> NDArray[np.uint8]:
     """The empty table, (height, width, 3)."""
-    scale = min(width, height) / (2 * _VIEW)
-    x = np.abs((np.arange(width) + 0.5 - width / 2) / scale)
-    y = np.abs((np.arange(height) + 0.5 - height / 2) / scale)
+    x, y = (np.abs(at) for at in VIEW.points(width, height))
     inside = (x < WALL)[None, :] & (y < WALL)[:, None]
     return np.asarray(np.where(inside[..., None], TABLE, BORDER))

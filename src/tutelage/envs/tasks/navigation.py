@@ -10,7 +10,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.envs.tasks.base import Array, ArrayTask, World
+from tutelage.envs.tasks.base import Array, ArrayTask, View, World
 
 SIZE = (100, 61)
 """Cells of the maze along x and y."""
@@ -37,6 +37,8 @@ def _walls() -> NDArray[np.bool_]:
 
 WALLS = _walls()
 """Whether each cell (x, y) is wall, (100, 61)."""
+VIEW = View((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2, *SIZE)
+"""What pictures show: all cells. Beyond them all is wall."""
 _DOT = 1.5
 """Radius of the robot in pictures."""
 FLOOR, WALL, WIND, FINISH, ROBOT = np.array(
@@ -94,10 +96,9 @@ class Navigation(ArrayTask):
 @functools.lru_cache(16)
 def _maze(width: int, height: int) -> tuple[Array, Array, NDArray[np.uint8]]:
     """The x of a picture's columns, the y of its rows, and the maze without a robot, (height, width, 3)."""
-    x = (np.arange(width) + 0.5) / width * SIZE[0] - 0.5
-    y = SIZE[1] - (np.arange(height) + 0.5) / height * SIZE[1] - 0.5  # +y is up
-    cell = np.ix_(np.rint(x).astype(int), np.rint(y).astype(int))
+    x, y = VIEW.points(width, height)
+    columns, rows = (np.rint(at).clip(0, cells - 1).astype(int) for at, cells in zip((x, y), SIZE, strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1)
     floor = np.where(((points[..., 0] >= WINDY[0]) & (points[..., 0] <= WINDY[1]))[..., None], WIND, FLOOR)
     floor = np.where((np.linalg.norm(points - GOAL, axis=-1) <= GOAL_RADIUS)[..., None], FINISH, floor)
-    return x, y, np.asarray(np.where(WALLS[cell].T[..., None], WALL, floor))
+    return x, y, np.asarray(np.where(WALLS[np.ix_(columns, rows)].T[..., None], WALL, floor))
