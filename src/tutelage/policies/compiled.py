@@ -24,7 +24,7 @@ LIMIT = np.float32(networks.LIMIT)
 ZERO, ONE = np.float32(0), np.float32(1)
 RECTIFIED, TANH, SIGMOID = 0, 1, 2
 """What follows the sums of a layer."""
-PART = 128
+PART = 64
 """Robots that a network is asked about at a time: with fewer, products would be too small to be fast."""
 FEW = 16
 """For fewer robots than this, other threads would take longer to wake than to answer."""
