@@ -1,4 +1,4 @@
-"""The whole loop against code in the usual shape, and against the floor: raw physics plus raw gradient steps."""
+"""The whole loop against code in the usual shape, and against raw physics plus raw gradient steps, ours or PyTorch's."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from tutelage.experiments.assemble import Assembly
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.modes import MOVING
 from tutelage.fleet.step import Step
+from tutelage.learning.regression import BatchedRegression
+from tutelage.learning.twins import BatchedTwins
 
 PRETRAIN = 100
 TOGETHER = "physics, gradients of the policy"
@@ -95,10 +97,19 @@ class RawPhysics:
 
 
 class RawGradients:
-    """The same updates of policy and critic in the same compiled code, always on the same batches: nothing else happens."""
+    """The same updates of policy and critic, always on the same batches: nothing else happens.
 
-    def __init__(self, assembly: Assembly, steps: int) -> None:
+    library: by PyTorch, members and twins as batched products, instead of in our compiled code.
+    """
+
+    def __init__(self, assembly: Assembly, steps: int, library: bool = False) -> None:
         self.learner, self.steps = assembly.learner, steps
+        if library:
+            policy, c = assembly.policy, assembly.config
+            scale = policy.obs_mean, policy.obs_std, policy.action_middle, policy.action_half
+            self.learner.regression = BatchedRegression(policy, c.learner.learning_rate)
+            for critic in self.learner.critics.values():
+                critic.twins = BatchedTwins(critic.net, critic.target, scale, True, c.critic.learning_rate, c.critic.tau)
         rows = self.learner.dataset.draw(assembly.config.learner.batch)
         self.learner.dataset.draw = lambda size: rows  # type: ignore[method-assign]
         for critic in self.learner.critics.values():
@@ -169,7 +180,7 @@ def run(quick: bool = False) -> dict[str, Any]:
     return {"loop": results}
 
 
-VARIANTS = ("original", "ours", "ours, overlap", "raw physics", "raw gradients")
+VARIANTS = ("original", "ours", "ours, overlap", "raw physics", "raw gradients", "raw gradients, PyTorch")
 
 
 def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
@@ -177,6 +188,7 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
     lockstep, overlap = (Ours(task, steps, overlap=o) for o in (False, True))
     floor = Ours(task, steps)
     physics, gradients = RawPhysics(floor.assembly, floor.loop, steps), RawGradients(floor.assembly, steps)
+    library = RawGradients(ready(task, pretrain=PRETRAIN), steps, library=True)
     data, moved = lockstep.assembly.learner.dataset, Headcount()
     original = OriginalLoop(
         task, lockstep.assembly.config, lockstep.assembly.actor,
@@ -190,13 +202,15 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
     seconds = take_turns(
         {
             "original": lambda: original.run(steps), "ours": lockstep, "ours, overlap": overlap,
-            "raw physics": physics, "raw gradients": gradients,
+            "raw physics": physics, "raw gradients": gradients, "raw gradients, PyTorch": library,
         }, rounds, before={
-            "original": share, "ours": lockstep.threads, "ours, overlap": overlap.threads, "raw physics": physics.rewind,
+            "original": share, "raw gradients, PyTorch": share, "ours": lockstep.threads, "ours, overlap": overlap.threads,
+            "raw physics": physics.rewind,
         },
     )  # fmt: skip
     original.envs.close()
     floors = ("raw physics", "raw gradients")
+    public = ("raw physics", "raw gradients, PyTorch")
     return {
         "milliseconds": {name: 1e3 * float(np.median(seconds[name])) / steps for name in VARIANTS},
         "ratios": {
@@ -204,6 +218,8 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
             "original / overlap": ratio(seconds, "original", "ours, overlap"),
             "ours / floor": ratio(seconds, "ours", *floors),
             "overlap / floor": ratio(seconds, "ours, overlap", *floors),
+            "ours / floor with PyTorch": ratio(seconds, "ours", *public),
+            "overlap / floor with PyTorch": ratio(seconds, "ours, overlap", *public),
         },
         "robots that moved": {"original": moved.mean, "ours": lockstep.moved.mean, "ours, overlap": overlap.moved.mean},
         "phases": {name: 1e3 * took / steps / rounds for name, took in sorted(phases.seconds.items(), key=lambda p: -p[1])},

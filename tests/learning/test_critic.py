@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from hypothesis import given
@@ -62,12 +63,17 @@ def test_a_ring_is_a_queue_of_limited_length(capacity, parts) -> None:
 
 
 def test_a_ring_takes_memory_as_it_fills() -> None:
-    ring = Ring(100_000, 2, 1)
-    assert len(ring.rows) == 0
-    ring.add(rows(0, 10))
-    assert len(ring.rows) <= 1024
-    ring.add(rows(10, 5000))
-    assert len(ring.rows) < 20_000
+    def resident() -> float:
+        return psutil.Process().memory_info().rss / 2**20  # MiB
+
+    before = resident()
+    ring = Ring(100_000, 500, 3)  # 383 MiB when it is full
+    assert resident() - before < 20
+    some = np.ones((10_000, 1004), np.float32)
+    ready = resident()
+    ring.add(some)
+    assert 20 < resident() - ready < 80
+    assert ring.size == 10_000
 
 
 def test_draws_are_uniform_over_what_is_kept_and_rows_stay_together() -> None:

@@ -78,7 +78,9 @@ class Ring:
         self.dtype = stored_as(obs)
         number, width = 4 if self.dtype == torch.uint8 else 1, math.prod(self.obs_shape)
         self.widths = {"obs": width, "action": number * action_width, "next_obs": width, "end": number}
-        self.rows = torch.zeros(0, sum(self.widths.values()), dtype=self.dtype)
+        # As NumPy leaves it to the system to give memory when it is first written to, all may be asked for at once.
+        kind = np.uint8 if self.dtype == torch.uint8 else np.float32
+        self.rows = torch.from_numpy(np.zeros((capacity, sum(self.widths.values())), dtype=kind))
 
     def pack(self, obs: Array, action: Array, next_obs: Array, end: Array) -> Array:
         """n transitions as rows (n, width)."""
@@ -90,20 +92,16 @@ class Ring:
         return np.concatenate(parts, axis=1, dtype=numbers[0].dtype)
 
     def add(self, rows: Array) -> None:
-        """Append transitions (n, width); memory grows up to the capacity, then the oldest give way."""
+        """Append transitions (n, width); when there is no room any more, the oldest give way."""
         rows = rows[-self.capacity :]
-        wanted, room = self.size + len(rows), len(self.rows)
-        if room < min(wanted, self.capacity):
-            more = min(max(1024, 2 * room, wanted), self.capacity) - room
-            self.rows = torch.cat([self.rows, self.rows.new_zeros(more, self.rows.shape[1])])
-        first = rows[: len(self.rows) - self.cursor]
+        first = rows[: self.capacity - self.cursor]
         rest = rows[len(first) :]
         self.rows[self.cursor : self.cursor + len(first)] = torch.from_numpy(first)
         self.rows[: len(rest)] = torch.from_numpy(rest)
         self.cursor += len(rows)
         if self.cursor >= self.capacity:
             self.cursor -= self.capacity
-        self.size = min(wanted, self.capacity)
+        self.size = min(self.size + len(rows), self.capacity)
 
     def columns(self, rows: Tensor) -> dict[str, Tensor]:
         """The parts of rows (n, width), by name: views."""
@@ -122,8 +120,8 @@ class Ring:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.rows = torch.from_numpy(state["rows"].copy())
-        self.size, self.cursor = len(self.rows), state["cursor"]
+        self.size, self.cursor = len(state["rows"]), state["cursor"]
+        self.rows[: self.size] = torch.from_numpy(state["rows"])
 
 
 class Critic:
