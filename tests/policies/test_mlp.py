@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -62,3 +64,24 @@ def test_initial_weights_are_as_wide_as_those_of_torch() -> None:
         for values in (weight.detach(), bias.detach()):
             assert values.abs().max() <= bound
             assert values.std() == pytest.approx(bound / np.sqrt(3), rel=0.1)
+
+
+def test_arrays_are_the_parameters_whatever_happens_to_these() -> None:
+    def check(net: BatchedMLP) -> None:
+        for arrays, parameters in zip(net.arrays(), (net.weights, net.biases), strict=True):
+            for array, parameter in zip(arrays, parameters, strict=True):
+                array += 1.0
+                np.testing.assert_array_equal(array, parameter.detach().numpy())
+
+    net, (other, _) = pair((7,))[0], pair((7,), seed=1)
+    check(net)
+    net.load_state_dict(other.state_dict())
+    check(net)
+    before = net.arrays()
+    net.adopt(*(tuple(array * 2 for array in arrays) for arrays in before))
+    check(net)
+    net.weights[0].data = torch.zeros_like(net.weights[0])
+    check(net)
+    again = copy.deepcopy(net)
+    check(again)
+    assert not np.array_equal(again.arrays()[0][0], net.arrays()[0][0])

@@ -44,6 +44,8 @@ class BatchedMLP(nn.Module):
             bound = 1 / math.sqrt(a)
             for parameters, shape in ((self.weights, (members, a, b)), (self.biases, (members, 1, b))):
                 parameters.append(nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) * bound))
+        self._at: list[int] = []
+        self._arrays: tuple[Arrays, Arrays] = (), ()
         self._layers = list(zip(self.weights, self.biases, strict=True))  # a ParameterList takes long to say what it holds
 
     def forward(self, x: Tensor, extra: Tensor | None = None) -> Tensor:
@@ -63,8 +65,11 @@ class BatchedMLP(nn.Module):
 
     def arrays(self) -> tuple[Arrays, Arrays]:
         """Weights (K, a, b) and biases (K, 1, b) of each layer as arrays, which share their memory with the parameters."""
-        weights, biases = zip(*((w.detach().numpy(), b.detach().numpy()) for w, b in self._layers), strict=True)
-        return weights, biases
+        at = [parameter.data_ptr() for layer in self._layers for parameter in layer]
+        if at != self._at:  # it takes long to ask PyTorch for them
+            weights, biases = zip(*((w.detach().numpy(), b.detach().numpy()) for w, b in self._layers), strict=True)
+            self._at, self._arrays = at, (weights, biases)
+        return self._arrays
 
     def adopt(self, weights: Arrays, biases: Arrays) -> None:
         """Let these arrays, of the same shapes, be the parameters from now on; those of before are free."""
