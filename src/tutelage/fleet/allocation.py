@@ -50,10 +50,13 @@ class FleetDAgger:
         wanted = highest(ranks, len(free), exclude=robots[robots != NOBODY], rng=rng)
 
         # Lines 7-10 fell through, yet the robot is still among the best.
-        stays = free[np.isin(previous[free], wanted, kind="table")]
+        needs = np.zeros(len(ranks), dtype=bool)
+        needs[wanted] = True
+        stays = free[(previous[free] != NOBODY) & needs[previous[free]]]
         robots[stays] = previous[stays]
-        others = wanted[~np.isin(wanted, robots[stays], kind="table")]
-        movers = free[~np.isin(free, stays, kind="table")][: len(others)]  # lines 15-17
+        needs[previous[stays]] = False
+        others = wanted[needs[wanted]]
+        movers = free[robots[free] == NOBODY][: len(others)]  # lines 15-17
         robots[movers] = others
         return robots
 
