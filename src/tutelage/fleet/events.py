@@ -50,7 +50,7 @@ class Journal:
         n = len(robots)
         if n:
             self.parts.append(
-                Events(np.full(n, self.t), np.asarray(robots), np.broadcast_to(humans, n).astype(np.int64),
+                Events(np.full(n, self.t), np.asarray(robots), np.full(n, humans, dtype=np.int64),
                        np.full(n, int(event)), np.asarray(modes, dtype=np.int64))
             )  # fmt: skip
 
