@@ -82,6 +82,27 @@ def test_what_a_piece_raises_comes_when_all_have_ended(threads) -> None:
     assert Together(threads, [lambda: 1]).results() == [1]  # the helpers live on
 
 
+def test_ctrl_c_reaches_the_thread_that_waits_whoever_the_piece_is_for() -> None:
+    go_on, began = threading.Event(), threading.Event()
+
+    def held_up() -> None:
+        began.set()
+        go_on.wait(20)
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    first = Together(2, [held_up])
+    assert began.wait(20)
+    second = Together(2, [interrupted])
+    with pytest.raises(KeyboardInterrupt):
+        first.results()  # does the other piece meanwhile
+    go_on.set()
+    first.results()
+    with pytest.raises(KeyboardInterrupt):
+        second.results()
+
+
 @numba.njit(nogil=True)
 def mark(counter, times, by) -> None:  # type: ignore[no-untyped-def]
     while True:

@@ -85,9 +85,12 @@ class _Piece:
         if self.begun.acquire(blocking=False):
             try:
                 self.result = self.work()
-            except BaseException as error:  # for whoever asks for the result
-                self.error = error
-            self.ended.release()
+            except BaseException as error:
+                self.error = error  # for whoever asks for the result
+                if not isinstance(error, Exception):
+                    raise  # Ctrl-C is for the thread that it reached, whoever the piece is for
+            finally:
+                self.ended.release()
 
 
 class _Helpers:
