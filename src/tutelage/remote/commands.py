@@ -13,7 +13,8 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from tutelage.errors import ConfigError
+from tutelage.errors import ConfigError, TutelageError
+from tutelage.remote.folders import claim
 
 DRIVER_FAILED = 3
 """Exit status of `tutelage robot` when the driver goes on failing: whoever started it may start it again."""
@@ -55,12 +56,14 @@ def robot(
     """
     from tutelage.remote.driver import make_driver
     from tutelage.remote.robot import DriverFailed, Robot, RobotConfig
+    from tutelage.remote.telling import Teller, told
     from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.health import node_health
     from tutelage.sgc.health_server import HealthServer
     from tutelage.sgc.node import Node
 
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    teller = Teller()
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[teller.handler()])
     status = 0
     config = RobotConfig(hz, watchdog, slew, camera_hz, quality, seed)
     if min(size) < 16 or max(size) > 4096:
@@ -69,33 +72,39 @@ def robot(
         stop = stack.enter_context(until_stopped())
         if hasattr(signal, "SIGHUP"):  # the terminal is gone: hold, then end
             signal.signal(signal.SIGHUP, lambda number, frame: stop.set())
+        stack.enter_context(claim(home, "a robot"))
         node = stack.enter_context(Node.open(home))
-        driver = make_driver(env, render=cameras, size=size)
-        stack.callback(getattr(driver, "close", lambda: None))
-        own = None
-        if policy:
-            from tutelage.remote.weights import PulledPolicy
-
-            own = stack.enter_context(PulledPolicy(node))
-
-        def report(line: str) -> None:
-            with contextlib.suppress(OSError):  # nobody reads it any more; the robot goes on
-                print(f"{node.name}: {line}", flush=True)
-
-        running = stack.enter_context(Robot(node, driver, config, report, own))
-        if health is not None:
-            stack.enter_context(
-                HealthServer(health, lambda: node_health(node), lambda: {**node.counters(), "robot": running.counters})
-            )
-        seen = ", ".join(running.eyes.names)
-        report(f"{env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it")
         try:
+            try:
+                driver = make_driver(env, render=cameras, size=size)
+            except TutelageError:
+                raise
+            except Exception as error:
+                raise DriverFailed(f"the driver of {node.name} failed: {told(error)}") from error
+            stack.callback(_quietly, getattr(driver, "close", lambda: None))
+            own = None
+            if policy:
+                from tutelage.remote.weights import PulledPolicy
+
+                own = stack.enter_context(PulledPolicy(node))
+
+            def report(line: str) -> None:
+                teller.say(f"{node.name}: {line}")
+
+            running = stack.enter_context(Robot(node, driver, config, report, own))
+            if health is not None:
+                stack.enter_context(
+                    HealthServer(health, lambda: node_health(node), lambda: {**node.counters(), "robot": running.counters})
+                )
+            seen = ", ".join(running.eyes.names)
+            report(f"{env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it")
             running.run(stop)
         except DriverFailed as error:
-            print(f"tutelage: {error}", file=sys.stderr)
+            teller.say(f"tutelage: {error}", error=True)
             status = DRIVER_FAILED
         else:
             report("ended")
+    teller.close()
     _leave(status)
 
 
@@ -166,6 +175,14 @@ def status(home: Positional[Path], seconds: float = 3.0) -> None:
             age = "" if row["age"] is None else f"heard {row['age']:.2f} s ago, episode {row['episode']}, step {row['step']}"
             print(f"{row['name']:<24} {row['state']:<10} {age} {row['says']}".rstrip())
     _leave(0)
+
+
+def _quietly(close: Callable[[], None]) -> None:
+    """A driver that cannot be closed: the robot holds, and the program ends in any case."""
+    try:
+        close()
+    except Exception as error:
+        logging.warning("the driver could not be closed: %s: %s", type(error).__name__, error)
 
 
 def _leave(status: int) -> None:

@@ -11,6 +11,7 @@ A reset goes on while the loop does: the robot is out of reach until the first o
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import threading
 import time
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet, Mask
 from tutelage.remote import topics
+from tutelage.remote.folders import claim
 from tutelage.remote.jpeg import decode
 from tutelage.remote.messages import Command, Description, Flag, Malformed, Order, Weights
 from tutelage.remote.robots import Robots
@@ -103,7 +105,9 @@ class RemoteFleet(Fleet):
         self.server = secrets.randbits(64) | 1
         self.late = 0.0
         self.metadata = {**self.metadata, "render_fps": round(hz or 10)}
-        self._own_node = own_node
+        self._own = contextlib.ExitStack()
+        if own_node:
+            self._own.callback(node.close)
         self._closed = threading.Event()
         self._weights: Weights | None = None
         self._served: Handle | None = None
@@ -137,14 +141,15 @@ class RemoteFleet(Fleet):
             settings: see `__init__`.
 
         Raises:
-            KeysError, NotIssued, ConfigError: the folder cannot be used, or no robot answers.
+            KeysError, NotIssued, ConfigError: the folder cannot be used, or another server uses it, or no robot answers.
         """
-        node = Node.open(home)
-        try:
-            return cls(node, robots, own_node=True, **settings)
-        except BaseException:
-            node.close()
-            raise
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(claim(home, "a server"))
+            node = Node.open(home)
+            stack.callback(node.close)
+            made = cls(node, robots, **settings)
+            made._own = stack.pop_all()
+        return made
 
     @property
     def description(self) -> Description:
@@ -159,7 +164,7 @@ class RemoteFleet(Fleet):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of each robot's cameras."""
+        """Names of the robots' cameras; one robot or another may lack some of them."""
         return self.description.cameras
 
     @property
@@ -243,8 +248,7 @@ class RemoteFleet(Fleet):
         for publisher in self._commands:
             publisher.close()
         self._tending.close()
-        if self._own_node:
-            self.node.close()
+        self._own.close()
 
     def state_dict(self) -> dict[str, Any]:
         raise ConfigError("a fleet of real robots cannot be checkpointed: the world has no state that could be restored")
@@ -286,9 +290,10 @@ class RemoteFleet(Fleet):
         slot = self._slots[robot]
         if not 0 <= camera < len(self.cameras):
             return None
+        name = self.cameras[camera]
         with self._news:
-            slot.watch(camera, time.monotonic())
-            found = slot.pictures.get(camera)
+            slot.watch(name, time.monotonic())
+            found = slot.pictures.get(name)
         return None if found is None else (found[0], found[1].jpeg)
 
     def proposals(self) -> tuple[Array, NDArray[np.int64]]:
@@ -345,7 +350,7 @@ class RemoteFleet(Fleet):
         with self._news:
             names = slot.description.cameras if slot.description is not None else ()
             if camera in names:
-                slot.look(message.payload, names.index(camera), message.received)
+                slot.look(message.payload, camera, message.received)
             else:
                 slot.counts.add("camera")
 
