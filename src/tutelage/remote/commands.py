@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from tutelage.errors import ConfigError, TutelageError
+from tutelage.errors import ConfigError
 from tutelage.remote.folders import claim
 
 DRIVER_FAILED = 3
@@ -54,9 +54,9 @@ def robot(
         policy: decide on the robot, with weights that the server hands out; the server overrides.
         health: HOST:PORT at which to serve /healthz and /metrics; default: they are not served.
     """
-    from tutelage.remote.driver import make_driver
-    from tutelage.remote.robot import DriverFailed, Robot, RobotConfig
-    from tutelage.remote.telling import Teller, told
+    from tutelage.remote.driver import DriverFailed, make_driver
+    from tutelage.remote.robot import Robot, RobotConfig
+    from tutelage.remote.telling import Teller
     from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.health import node_health
     from tutelage.sgc.health_server import HealthServer
@@ -75,12 +75,7 @@ def robot(
         stack.enter_context(claim(home, "a robot"))
         node = stack.enter_context(Node.open(home))
         try:
-            try:
-                driver = make_driver(env, render=cameras, size=size)
-            except TutelageError:
-                raise
-            except Exception as error:
-                raise DriverFailed(f"the driver of {node.name} failed: {told(error)}") from error
+            driver = make_driver(env, render=cameras, size=size)
             stack.callback(_quietly, getattr(driver, "close", lambda: None))
             own = None
             if policy:

@@ -37,12 +37,24 @@ from tutelage.remote.tending import Tending, send
 from tutelage.remote.wire import pack_command, pack_weights, unpack_weights
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
+from tutelage.sgc.reasons import Reason
+from tutelage.sgc.subscription import Subscription
 from tutelage.sgc.transport.base import Handle
 
 Array = NDArray[Any]
 
 FILE = "fleet.json"
 """In the server's folder: what the robots are, so that a server that starts again need not wait for one of them."""
+
+REFUSED = 3
+"""Messages of a robot that is not heard which the network has refused, before that is said to be why."""
+
+_CLOCKS = ": its clock and the server's differ; set them (NTP)"
+REMEDIES = {
+    Reason.FUTURE.value: _CLOCKS,
+    Reason.TOO_OLD.value: _CLOCKS,
+    Reason.STALE.value: ": another program has sent under its name, or its clock was set back; start it again",
+}
 
 
 class RemoteFleet(Fleet):
@@ -117,10 +129,13 @@ class RemoteFleet(Fleet):
         self._started = False
         self._commands = [node.publisher(topics.alias(name, topics.COMMAND)) for name in self.names]
         self._tending = Tending(node, self._robots, self.server)
-        self._subscriptions = []
+        self._subscriptions: list[Subscription] = []
+        self._lanes: dict[str, Subscription] = {}
+        self._refused_before: dict[str, dict[str, int]] = {}
         for slot in self._slots:
             seen = topics.alias(slot.name, topics.OBSERVATION)
-            self._subscriptions.append(node.subscribe(seen, partial(self._on_observation, slot)))
+            self._lanes[slot.name] = node.subscribe(seen, partial(self._on_observation, slot))
+            self._subscriptions.append(self._lanes[slot.name])
             for camera in topics.cameras_in(slot.name, set(node.access.topics)):
                 lane = topics.alias(slot.name, topics.PICTURE, camera)
                 self._subscriptions.append(node.subscribe(lane, partial(self._on_picture, slot, camera)))
@@ -323,7 +338,11 @@ class RemoteFleet(Fleet):
     def status(self) -> list[dict[str, Any]]:
         """Of each robot: name, state (never, gone, misfit, asking, stopped, resetting, fault, online), seconds since it was
         heard, round trip in seconds, episode, step, starts, what it and we refused, and what there is to say."""
-        return self._robots.status()
+        rows = self._robots.status()
+        for row in rows:
+            if row["state"] in ("never", "gone") and not row["says"]:
+                row["says"] = self._why_unheard(row["name"])
+        return rows
 
     def refused(self) -> dict[str, int]:
         """What was dropped, by reason: by this fleet, and by the network as not genuine."""
@@ -333,13 +352,28 @@ class RemoteFleet(Fleet):
                 total[f"network_{reason}"] = total.get(f"network_{reason}", 0) + count
         return total
 
+    def _why_unheard(self, name: str) -> str:
+        """What the network refuses of a robot since it was heard last, if it does."""
+        before = self._refused_before.get(name, {})
+        counts = self._lanes[name].opener.refusals.as_dict()
+        since = {reason: count - before.get(reason, 0) for reason, count in counts.items()}
+        reason = max(since, key=lambda reason: since[reason], default="")
+        if not reason or since[reason] < REFUSED:
+            return ""
+        return f"what it sends is refused ({reason}){REMEDIES.get(reason, '')}"
+
     # -- on the network's threads -------------------------------------------------------------------------------------------
 
     def _on_observation(self, slot: Slot, message: Message) -> None:
         now = time.monotonic()
+        if (lane := self._lanes.get(slot.name)) is not None:
+            self._refused_before[slot.name] = lane.opener.refusals.as_dict()
         with self._news:
+            fitted = not slot.misfit
             if slot.observe(message.payload, self._robots.description, self.server, now):
                 self._news.notify_all()
+            elif fitted and slot.misfit:
+                self._robots.misfits(slot)
 
     def _on_weights(self, message: Message) -> bytes:
         asked, weights = unpack_weights(message.payload), self._weights

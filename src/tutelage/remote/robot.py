@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from tutelage.errors import ConfigError, ContractError, TutelageError
 from tutelage.remote import jpeg, topics
-from tutelage.remote.driver import Driver, describe, observation_of
+from tutelage.remote.driver import Driver, DriverFailed, describe, observation_of
 from tutelage.remote.eyes import Eyes
 from tutelage.remote.gate import CommandGate
 from tutelage.remote.latch import Latch
@@ -54,10 +54,6 @@ between, while it holds."""
 
 ANSWERS = 64
 """Resets that are recognised when they are asked for again."""
-
-
-class DriverFailed(TutelageError):
-    """The driver goes on failing; the robot was told to hold."""
 
 
 class OwnPolicy(Protocol):

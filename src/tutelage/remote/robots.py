@@ -77,10 +77,14 @@ class Robots:
                 self._remember()
         else:
             slot.misfit = _difference(said, self.description)
-            log.warning(
-                "%s does not fit into this fleet: %s; if the fleet is another one now, remove %s",
-                slot.name, slot.misfit, self._file,
-            )  # fmt: skip
+            self.misfits(slot)
+
+    def misfits(self, slot: Slot) -> None:
+        """Say that a robot does not fit, and what to do."""
+        log.warning("%s does not fit into this fleet: %s", slot.name, self._says(slot))
+
+    def _says(self, slot: Slot) -> str:
+        return f"{slot.misfit}; if the fleet is another one now, remove {self._file}" if slot.misfit else ""
 
     def known(self, wait: float) -> Description:
         """What robots are, as soon as one has said so.
@@ -118,7 +122,7 @@ class Robots:
                         "stale": seen.stale if seen is not None else 0,
                         "refused_there": seen.refused if seen is not None else 0,
                         "refused_here": dict(slot.counts.by_reason),
-                        "says": slot.misfit,
+                        "says": self._says(slot),
                     }
                 )
             return rows
