@@ -85,6 +85,23 @@ def test_a_terminal_that_takes_nothing_does_not_keep_a_robot_from_holding_or_end
         os.close(writing)
 
 
+def test_a_driver_that_never_returns_is_stopped_and_left_behind_when_the_program_shall_end(
+    field: Field, fleet: RemoteFleet
+) -> None:
+    slow = field.log(2).with_suffix(".slow")
+    slow.write_text("600")
+    robot, began = field.robots[2], time.monotonic()
+    try:
+        drive(lambda: fleet.step(STILL), lambda: field.moves(2, began))
+        robot.send_signal(signal.SIGINT)
+        assert robot.wait(20) == 3
+    finally:
+        slow.unlink()
+        field.kill(2)
+    assert field.notes(2)[-1].what == "stop"
+    assert "the driver has not returned for 5 s; it was told to stop, and the program ends" in said(robot)
+
+
 def test_lines_that_nobody_reads_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     written: list[bytes] = []
     monkeypatch.setattr("tutelage.remote.telling.os.write", lambda to, line: written.append(line) or len(line))

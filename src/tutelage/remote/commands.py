@@ -7,17 +7,26 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from tutelage.errors import ConfigError
 from tutelage.remote.folders import claim
+from tutelage.remote.telling import Teller
+
+if TYPE_CHECKING:
+    from tutelage.remote.driver import Driver
 
 DRIVER_FAILED = 3
 """Exit status of `tutelage robot` when the driver goes on failing: whoever started it may start it again."""
+
+ENDING = 5.0
+"""Seconds from Ctrl-C for which a driver that does not return is waited for."""
 
 
 def robot(
@@ -56,7 +65,6 @@ def robot(
     """
     from tutelage.remote.driver import DriverFailed, make_driver
     from tutelage.remote.robot import Robot, RobotConfig
-    from tutelage.remote.telling import Teller
     from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.health import node_health
     from tutelage.sgc.health_server import HealthServer
@@ -93,7 +101,12 @@ def robot(
                 )
             seen = ", ".join(running.eyes.names)
             report(f"{env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it")
-            running.run(stop)
+            ended = threading.Event()
+            threading.Thread(target=_insist, args=(stop, ended, driver, teller), name="robot-end", daemon=True).start()
+            try:
+                running.run(stop)
+            finally:
+                ended.set()
         except DriverFailed as error:
             teller.say(f"tutelage: {error}", error=True)
             status = DRIVER_FAILED
@@ -172,12 +185,27 @@ def status(home: Positional[Path], seconds: float = 3.0) -> None:
     _leave(0)
 
 
+def _insist(stop: threading.Event, ended: threading.Event, driver: Driver, teller: Teller) -> None:
+    """A driver that does not return keeps nobody from ending the program: it is told to stop from here, and left behind."""
+    stop.wait()
+    if ended.wait(ENDING):
+        return
+    halt = threading.Thread(target=_quietly, args=(getattr(driver, "stop", lambda: None),), daemon=True)
+    halt.start()
+    halt.join(1.0)
+    teller.say(
+        f"tutelage: the driver has not returned for {ENDING:g} s; it was told to stop, and the program ends", error=True
+    )
+    teller.close()
+    os._exit(DRIVER_FAILED)
+
+
 def _quietly(close: Callable[[], None]) -> None:
-    """A driver that cannot be closed: the robot holds, and the program ends in any case."""
+    """What the driver raises now is of no consequence: the program ends in any case."""
     try:
         close()
     except Exception as error:
-        logging.warning("the driver could not be closed: %s: %s", type(error).__name__, error)
+        logging.warning("the driver failed in the end: %s: %s", type(error).__name__, error)
 
 
 def _leave(status: int) -> None:
