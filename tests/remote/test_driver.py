@@ -13,7 +13,7 @@ from remote.point import Point
 from tutelage.envs import experts
 from tutelage.envs.registry import make_fleet
 from tutelage.errors import ConfigError, ContractError
-from tutelage.remote.driver import Driver, FleetDriver, GymnasiumDriver, check_driver, describe, make_driver
+from tutelage.remote.driver import Driver, DriverFailed, FleetDriver, GymnasiumDriver, check_driver, describe, make_driver
 
 
 class Lamp(gym.Env[np.ndarray, np.ndarray]):
@@ -172,6 +172,32 @@ class BadCamera(Point):
 def test_a_broken_clause_is_named(point: Point, kind: type[Point], clause: str) -> None:
     with pytest.raises(ContractError, match=clause):
         check_driver(kind())
+
+
+@pytest.mark.parametrize("method", ["reset", "get_observation", "send_action", "hold", "violation", "cameras"])
+def test_a_driver_that_raises_is_told_to_hold_and_named_with_the_place(
+    point: Point, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    def fails(*given: object) -> None:
+        raise OSError("unplugged")
+
+    monkeypatch.setattr(point, method, fails)
+    held = len(point.log.read_text())
+    with pytest.raises(DriverFailed, match=r"^the driver Point failed: OSError: unplugged \(test_driver.py:\d+\)$"):
+        check_driver(point)
+    assert method == "hold" or "hold" in point.log.read_text()[held:]
+
+
+class Missing(Point):
+    def __init__(self) -> None:
+        raise OSError("no /dev/arm")
+
+
+def test_what_cannot_be_made_says_why_in_one_line() -> None:
+    with pytest.raises(
+        DriverFailed, match=r"the driver remote.test_driver:Missing cannot be made: OSError: no /dev/arm \(test_driv"
+    ):
+        make_driver("remote.test_driver:Missing")
 
 
 @pytest.mark.parametrize(

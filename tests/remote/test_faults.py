@@ -219,7 +219,9 @@ def test_a_robot_that_does_not_fit_is_left_out_and_the_others_go_on(field: Field
     drive(lambda: fleet.step(STILL), lambda: fleet.status()[1]["state"] == "misfit")
     info = fleet.step(STILL)[-1]
     assert info["online"].tolist() == [True, False, True]
-    assert "observes (5,) float32, and the fleet (2,) float32" in fleet.status()[1]["says"]
+    says = fleet.status()[1]["says"]
+    assert "observes (5,) float32, and the fleet (2,) float32" in says
+    assert says.endswith(f"if the fleet is another one now, remove {field.server / 'fleet.json'}")
     other.kill()
     other.wait()
 
@@ -236,6 +238,21 @@ def test_a_robot_whose_clock_is_wrong_by_seconds_works_like_any_other(field: Fie
     assert fleet.status()[0]["stale"] == 0
     fleet.stop(0)
     eventually(lambda: field.notes(1, began, "stop"), 1.0)
+    field.kill(1)
+
+
+def test_a_robot_whose_clock_is_wrong_by_a_minute_is_refused_and_the_server_knows_why(
+    field: Field, fleet: RemoteFleet
+) -> None:
+    all_move(fleet)
+    field.kill(1)
+    field.robots[1] = field.robot(1, "--hz", 20, skew=60.0)
+    began = time.monotonic()
+    drive(lambda: fleet.step(STILL), lambda: fleet.status()[0]["says"], 15.0)
+    assert fleet.status()[0]["state"] == "gone"
+    assert "is refused (future): its clock and the server's differ; set them (NTP)" in fleet.status()[0]["says"]
+    assert fleet.step(STILL)[-1]["online"].tolist() == [False, True, True]
+    assert not field.moves(1, began)
     field.kill(1)
 
 

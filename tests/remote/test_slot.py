@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from tutelage.remote.jpeg import encode
 from tutelage.remote.messages import Answer, Description, Flag, Observation, Picture
+from tutelage.remote.robots import Robots
 from tutelage.remote.slot import Slot
 from tutelage.remote.wire import pack_observation, pack_picture
 
@@ -93,8 +98,8 @@ def test_the_round_trip_leaves_out_what_the_robot_waited_itself(slot: Slot) -> N
 def test_damage_is_counted(slot: Slot) -> None:
     for bad in (b"", seen(2)[:-1]):
         assert not slot.observe(bad, FLEET, SERVER, 10.1)
-    assert not slot.look(b"JFIF", 0, 10.1)
-    assert not slot.look(pack_picture(Picture(1, 1, 0, 4, 4, b"no picture")), 0, 10.1)
+    assert not slot.look(b"JFIF", "front", 10.1)
+    assert not slot.look(pack_picture(Picture(1, 1, 0, 4, 4, b"no picture")), "front", 10.1)
     assert slot.counts["malformed"] == 4
 
 
@@ -106,3 +111,38 @@ def test_what_does_not_fit_is_forgotten_when_it_becomes_known_what_does(slot: Sl
     assert early.state(10.0, DEADLINE) == "misfit"
     assert early.observe(seen(1, boot=2), FLEET, SERVER, 10.1)  # it was started again, as what it should be
     assert not early.misfit
+
+
+def test_pictures_go_by_the_cameras_name_as_a_robot_may_lack_one() -> None:
+    """The bits of a command count the robot's own cameras; a fleet's order is another one where one of them is broken."""
+    made = Slot("arm")
+    made.observe(seen(1), FLEET, SERVER, 10.0)
+    made.watch("wrist", 10.0)
+    assert made.watched(10.0) == 0
+    made.description = replace(FLEET, cameras=("wrist",))
+    assert made.watched(10.0) == 0b1
+    made.description = replace(FLEET, cameras=("front", "wrist"))
+    assert made.watched(10.0) == 0b10
+    assert made.look(pack_picture(Picture(1, 1, 0, 4, 4, encode(np.zeros((4, 4, 3), np.uint8)))), "wrist", 10.1)
+    assert set(made.pictures) == {"wrist"}
+
+
+def test_a_fleet_has_the_cameras_that_any_of_its_robots_has(tmp_path: Path) -> None:
+    robots = Robots(("one", "two"), DEADLINE, tmp_path / "fleet.json")
+    for slot, cameras in zip(robots, (("wrist",), ("front", "wrist")), strict=True):
+        robots.introduce(slot, replace(FLEET, cameras=cameras))
+    assert robots.description is not None
+    assert robots.description.cameras == ("wrist", "front")
+    again = Robots(("one",), DEADLINE, tmp_path / "fleet.json").description
+    assert again is not None
+    assert again.cameras == ("wrist", "front")
+
+
+def test_a_fleet_whose_description_cannot_be_kept_is_one_all_the_same(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    robots = Robots(("one",), DEADLINE, tmp_path / "file" / "fleet.json")
+    robots.introduce(robots.slots[0], FLEET)
+    assert robots.slots[0].description == FLEET
+    assert "the next server will have to ask" in caplog.text

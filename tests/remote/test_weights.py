@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from remote.field import Field, drive
+from sgc.fleets import eventually
 
 from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.remote.fleet import RemoteFleet
-from tutelage.remote.weights import SharedPolicy
+from tutelage.remote.messages import Weights
+from tutelage.remote.weights import PulledPolicy, SharedPolicy
+from tutelage.remote.wire import pack_weights
 
 Policies = tuple[RemoteFleet, SharedPolicy, EnsemblePolicy]
 
@@ -88,3 +94,46 @@ def test_weights_of_an_earlier_server_are_not_taken_for_those_of_the_next(polici
     obs = fleet.step(np.zeros((1, 2), np.float32))[0]
     assert again.act(obs) == pytest.approx(policy.act(obs), abs=1e-5)
     drive(lambda: fleet.step(again.act(fleet._obs)), lambda: fleet.proposals()[1][0] == again.version)
+
+
+def full(*given: object) -> int:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_robot_whose_disk_is_full_for_a_while_fetches_the_weights_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = EnsemblePolicy((2,), np.full(2, -1.0), np.ones(2), members=2, hidden=(8,), seed=3)
+    made.save(tmp_path / "weights", {})
+    answer = pack_weights(Weights(5, (tmp_path / "weights").read_bytes()))
+    node: Any = SimpleNamespace(
+        name="arm", access=SimpleNamespace(entry=lambda alias: None), request=lambda alias, asked, wait: answer
+    )
+    monkeypatch.setattr("tutelage.remote.weights.FETCH_EVERY", 0.05)
+    with monkeypatch.context() as broken:
+        broken.setattr("tutelage.remote.weights.Path.write_bytes", full)
+        pulled = PulledPolicy(node)
+        time.sleep(0.5)
+        assert pulled.version == 0
+    eventually(lambda: pulled.version == 5)
+    pulled.close()
+    assert caplog.text.count("arm goes on with the policy that it has: OSError: [Errno 28] No space left on device") == 1
+
+
+def test_a_server_whose_disk_is_full_for_a_while_hands_out_the_weights_later(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    offered: list[Weights] = []
+    fleet: Any = SimpleNamespace(offer_policy=offered.append)
+    shared = SharedPolicy(fleet, EnsemblePolicy((2,), np.full(2, -1.0), np.ones(2), members=2, hidden=(8,), seed=3))
+    monkeypatch.setattr("tutelage.remote.weights.SHARE_EVERY", 0.0)
+    learned: Any = SimpleNamespace(losses={"loss": 1.0})
+    loop: Any = None
+    before = shared.version
+    with monkeypatch.context() as broken:
+        broken.setattr("tutelage.remote.weights.tempfile.mkdtemp", full)
+        shared.on_step(loop, learned)
+    assert shared.version == before
+    assert "the robots do not get the newest weights yet" in caplog.text
+    shared.on_step(loop, SimpleNamespace(losses={}))  # type: ignore[arg-type]
+    assert offered[-1].version == shared.version == before + 1

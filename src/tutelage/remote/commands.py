@@ -7,16 +7,26 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from tutelage.errors import ConfigError
+from tutelage.remote.folders import claim
+from tutelage.remote.telling import Teller
+
+if TYPE_CHECKING:
+    from tutelage.remote.driver import Driver
 
 DRIVER_FAILED = 3
 """Exit status of `tutelage robot` when the driver goes on failing: whoever started it may start it again."""
+
+ENDING = 5.0
+"""Seconds from Ctrl-C for which a driver that does not return is waited for."""
 
 
 def robot(
@@ -53,14 +63,15 @@ def robot(
         policy: decide on the robot, with weights that the server hands out; the server overrides.
         health: HOST:PORT at which to serve /healthz and /metrics; default: they are not served.
     """
-    from tutelage.remote.driver import make_driver
-    from tutelage.remote.robot import DriverFailed, Robot, RobotConfig
+    from tutelage.remote.driver import DriverFailed, make_driver
+    from tutelage.remote.robot import Robot, RobotConfig
     from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.health import node_health
     from tutelage.sgc.health_server import HealthServer
     from tutelage.sgc.node import Node
 
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    teller = Teller()
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[teller.handler()])
     status = 0
     config = RobotConfig(hz, watchdog, slew, camera_hz, quality, seed)
     if min(size) < 16 or max(size) > 4096:
@@ -69,33 +80,39 @@ def robot(
         stop = stack.enter_context(until_stopped())
         if hasattr(signal, "SIGHUP"):  # the terminal is gone: hold, then end
             signal.signal(signal.SIGHUP, lambda number, frame: stop.set())
+        stack.enter_context(claim(home, "a robot"))
         node = stack.enter_context(Node.open(home))
-        driver = make_driver(env, render=cameras, size=size)
-        stack.callback(getattr(driver, "close", lambda: None))
-        own = None
-        if policy:
-            from tutelage.remote.weights import PulledPolicy
-
-            own = stack.enter_context(PulledPolicy(node))
-
-        def report(line: str) -> None:
-            with contextlib.suppress(OSError):  # nobody reads it any more; the robot goes on
-                print(f"{node.name}: {line}", flush=True)
-
-        running = stack.enter_context(Robot(node, driver, config, report, own))
-        if health is not None:
-            stack.enter_context(
-                HealthServer(health, lambda: node_health(node), lambda: {**node.counters(), "robot": running.counters})
-            )
-        seen = ", ".join(running.eyes.names)
-        report(f"{env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it")
         try:
-            running.run(stop)
+            driver = make_driver(env, render=cameras, size=size)
+            stack.callback(_quietly, getattr(driver, "close", lambda: None))
+            own = None
+            if policy:
+                from tutelage.remote.weights import PulledPolicy
+
+                own = stack.enter_context(PulledPolicy(node))
+
+            def report(line: str) -> None:
+                teller.say(f"{node.name}: {line}")
+
+            running = stack.enter_context(Robot(node, driver, config, report, own))
+            if health is not None:
+                stack.enter_context(
+                    HealthServer(health, lambda: node_health(node), lambda: {**node.counters(), "robot": running.counters})
+                )
+            seen = ", ".join(running.eyes.names)
+            report(f"{env} at {hz:g} Hz{f', cameras {seen}' if seen else ''}; Ctrl-C ends it")
+            ended = threading.Event()
+            threading.Thread(target=_insist, args=(stop, ended, driver, teller), name="robot-end", daemon=True).start()
+            try:
+                running.run(stop)
+            finally:
+                ended.set()
         except DriverFailed as error:
-            print(f"tutelage: {error}", file=sys.stderr)
+            teller.say(f"tutelage: {error}", error=True)
             status = DRIVER_FAILED
         else:
             report("ended")
+    teller.close()
     _leave(status)
 
 
@@ -166,6 +183,29 @@ def status(home: Positional[Path], seconds: float = 3.0) -> None:
             age = "" if row["age"] is None else f"heard {row['age']:.2f} s ago, episode {row['episode']}, step {row['step']}"
             print(f"{row['name']:<24} {row['state']:<10} {age} {row['says']}".rstrip())
     _leave(0)
+
+
+def _insist(stop: threading.Event, ended: threading.Event, driver: Driver, teller: Teller) -> None:
+    """A driver that does not return keeps nobody from ending the program: it is told to stop from here, and left behind."""
+    stop.wait()
+    if ended.wait(ENDING):
+        return
+    halt = threading.Thread(target=_quietly, args=(getattr(driver, "stop", lambda: None),), daemon=True)
+    halt.start()
+    halt.join(1.0)
+    teller.say(
+        f"tutelage: the driver has not returned for {ENDING:g} s; it was told to stop, and the program ends", error=True
+    )
+    teller.close()
+    os._exit(DRIVER_FAILED)
+
+
+def _quietly(close: Callable[[], None]) -> None:
+    """What the driver raises now is of no consequence: the program ends in any case."""
+    try:
+        close()
+    except Exception as error:
+        logging.warning("the driver failed in the end: %s: %s", type(error).__name__, error)
 
 
 def _leave(status: int) -> None:

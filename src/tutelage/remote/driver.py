@@ -22,15 +22,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.envs.registry import find_task, make_fleet, task_names
-from tutelage.errors import ConfigError, ContractError
+from tutelage.errors import ConfigError, ContractError, TutelageError
 from tutelage.fleet.fleet import Fleet
 from tutelage.objects import make_object
 from tutelage.remote.messages import MAX_CAMERAS, Description, Malformed
 from tutelage.remote.simulated import FleetDriver, GymnasiumDriver
+from tutelage.remote.telling import told
 
 Array = NDArray[Any]
 
-__all__ = ["Driver", "FleetDriver", "GymnasiumDriver", "check_driver", "describe", "make_driver", "observation_of"]
+__all__ = [
+    "Driver",
+    "DriverFailed",
+    "FleetDriver",
+    "GymnasiumDriver",
+    "check_driver",
+    "describe",
+    "make_driver",
+    "observation_of",
+]
+
+
+class DriverFailed(TutelageError):
+    """A driver that raises something of its own, and goes on to; the robot was told to hold."""
 
 
 @runtime_checkable
@@ -83,7 +97,17 @@ def make_driver(name: str, *, render: bool = True, size: tuple[int, int] = (320,
 
     Raises:
         ConfigError: nothing of that name, or it makes something else.
+        DriverFailed: what makes it raises something of its own.
     """
+    try:
+        return _make_driver(name, render, size)
+    except TutelageError:
+        raise
+    except Exception as error:
+        raise DriverFailed(f"the driver {name} cannot be made: {told(error)}") from error
+
+
+def _make_driver(name: str, render: bool, size: tuple[int, int]) -> Driver:
     if ":" in name:
         made = make_object(name, "robot")
         if isinstance(made, gym.Env):
@@ -151,7 +175,19 @@ def check_driver(driver: Driver, *, seed: int = 0, steps: int = 50) -> None:
 
     Raises:
         ContractError: naming the broken clause.
+        DriverFailed: it raises something of its own.
     """
+    try:
+        _check_driver(driver, seed, steps)
+    except TutelageError:
+        raise
+    except Exception as error:
+        with contextlib.suppress(Exception):
+            driver.hold()
+        raise DriverFailed(f"the driver {type(driver).__name__} failed: {told(error)}") from error
+
+
+def _check_driver(driver: Driver, seed: int, steps: int) -> None:
     name = type(driver).__name__
     _demand(isinstance(driver, Driver), f"{name} is no driver; it needs get_observation, send_action, hold and the spaces")
     describe(driver, 0.1)

@@ -10,10 +10,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from tutelage.errors import TutelageError
 from tutelage.remote import jpeg
 from tutelage.remote.messages import Picture
 from tutelage.remote.simulated import Grab
+from tutelage.remote.telling import told
 from tutelage.remote.wire import pack_picture
 from tutelage.sgc.publisher import Publisher
 
@@ -86,10 +86,8 @@ class Eyes:
     def _take(self, name: str) -> NDArray[Any] | None:
         try:
             return self._cameras[name]()
-        except Exception:
-            self.failed += 1
-            if self.failed in (1, 10, 100):
-                log.exception("camera %s", name)
+        except Exception as error:
+            self._missed(name, error)
             return None
 
     def _work(self) -> None:
@@ -114,7 +112,10 @@ class Eyes:
             message = Picture(self._boot, self._number, self.names.index(name), width, height, compressed)
             self._publishers[name].send(pack_picture(message))
             self.sent += 1
-        except (TutelageError, ValueError) as error:
-            self.failed += 1
-            if self.failed in (1, 10, 100):
-                log.warning("camera %s: %s", name, error)
+        except Exception as error:  # what a camera gives may be anything, and the next one may be a picture
+            self._missed(name, error)
+
+    def _missed(self, name: str, error: Exception) -> None:
+        self.failed += 1
+        if self.failed in (1, 10, 100):
+            log.warning("camera %s gave no picture: %s", name, told(error))

@@ -11,6 +11,7 @@ A reset goes on while the loop does: the robot is out of reach until the first o
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import threading
 import time
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from tutelage.errors import ConfigError, ContractError
 from tutelage.fleet.fleet import Fleet, Mask
 from tutelage.remote import topics
+from tutelage.remote.folders import claim
 from tutelage.remote.jpeg import decode
 from tutelage.remote.messages import Command, Description, Flag, Malformed, Order, Weights
 from tutelage.remote.robots import Robots
@@ -35,12 +37,24 @@ from tutelage.remote.tending import Tending, send
 from tutelage.remote.wire import pack_command, pack_weights, unpack_weights
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
+from tutelage.sgc.reasons import Reason
+from tutelage.sgc.subscription import Subscription
 from tutelage.sgc.transport.base import Handle
 
 Array = NDArray[Any]
 
 FILE = "fleet.json"
 """In the server's folder: what the robots are, so that a server that starts again need not wait for one of them."""
+
+REFUSED = 3
+"""Messages of a robot that is not heard which the network has refused, before that is said to be why."""
+
+_CLOCKS = ": its clock and the server's differ; set them (NTP)"
+REMEDIES = {
+    Reason.FUTURE.value: _CLOCKS,
+    Reason.TOO_OLD.value: _CLOCKS,
+    Reason.STALE.value: ": another program has sent under its name, or its clock was set back; start it again",
+}
 
 
 class RemoteFleet(Fleet):
@@ -103,7 +117,9 @@ class RemoteFleet(Fleet):
         self.server = secrets.randbits(64) | 1
         self.late = 0.0
         self.metadata = {**self.metadata, "render_fps": round(hz or 10)}
-        self._own_node = own_node
+        self._own = contextlib.ExitStack()
+        if own_node:
+            self._own.callback(node.close)
         self._closed = threading.Event()
         self._weights: Weights | None = None
         self._served: Handle | None = None
@@ -113,10 +129,13 @@ class RemoteFleet(Fleet):
         self._started = False
         self._commands = [node.publisher(topics.alias(name, topics.COMMAND)) for name in self.names]
         self._tending = Tending(node, self._robots, self.server)
-        self._subscriptions = []
+        self._subscriptions: list[Subscription] = []
+        self._lanes: dict[str, Subscription] = {}
+        self._refused_before: dict[str, dict[str, int]] = {}
         for slot in self._slots:
             seen = topics.alias(slot.name, topics.OBSERVATION)
-            self._subscriptions.append(node.subscribe(seen, partial(self._on_observation, slot)))
+            self._lanes[slot.name] = node.subscribe(seen, partial(self._on_observation, slot))
+            self._subscriptions.append(self._lanes[slot.name])
             for camera in topics.cameras_in(slot.name, set(node.access.topics)):
                 lane = topics.alias(slot.name, topics.PICTURE, camera)
                 self._subscriptions.append(node.subscribe(lane, partial(self._on_picture, slot, camera)))
@@ -137,14 +156,15 @@ class RemoteFleet(Fleet):
             settings: see `__init__`.
 
         Raises:
-            KeysError, NotIssued, ConfigError: the folder cannot be used, or no robot answers.
+            KeysError, NotIssued, ConfigError: the folder cannot be used, or another server uses it, or no robot answers.
         """
-        node = Node.open(home)
-        try:
-            return cls(node, robots, own_node=True, **settings)
-        except BaseException:
-            node.close()
-            raise
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(claim(home, "a server"))
+            node = Node.open(home)
+            stack.callback(node.close)
+            made = cls(node, robots, **settings)
+            made._own = stack.pop_all()
+        return made
 
     @property
     def description(self) -> Description:
@@ -159,7 +179,7 @@ class RemoteFleet(Fleet):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of each robot's cameras."""
+        """Names of the robots' cameras; one robot or another may lack some of them."""
         return self.description.cameras
 
     @property
@@ -243,8 +263,7 @@ class RemoteFleet(Fleet):
         for publisher in self._commands:
             publisher.close()
         self._tending.close()
-        if self._own_node:
-            self.node.close()
+        self._own.close()
 
     def state_dict(self) -> dict[str, Any]:
         raise ConfigError("a fleet of real robots cannot be checkpointed: the world has no state that could be restored")
@@ -286,9 +305,10 @@ class RemoteFleet(Fleet):
         slot = self._slots[robot]
         if not 0 <= camera < len(self.cameras):
             return None
+        name = self.cameras[camera]
         with self._news:
-            slot.watch(camera, time.monotonic())
-            found = slot.pictures.get(camera)
+            slot.watch(name, time.monotonic())
+            found = slot.pictures.get(name)
         return None if found is None else (found[0], found[1].jpeg)
 
     def proposals(self) -> tuple[Array, NDArray[np.int64]]:
@@ -318,7 +338,11 @@ class RemoteFleet(Fleet):
     def status(self) -> list[dict[str, Any]]:
         """Of each robot: name, state (never, gone, misfit, asking, stopped, resetting, fault, online), seconds since it was
         heard, round trip in seconds, episode, step, starts, what it and we refused, and what there is to say."""
-        return self._robots.status()
+        rows = self._robots.status()
+        for row in rows:
+            if row["state"] in ("never", "gone") and not row["says"]:
+                row["says"] = self._why_unheard(row["name"])
+        return rows
 
     def refused(self) -> dict[str, int]:
         """What was dropped, by reason: by this fleet, and by the network as not genuine."""
@@ -328,13 +352,28 @@ class RemoteFleet(Fleet):
                 total[f"network_{reason}"] = total.get(f"network_{reason}", 0) + count
         return total
 
+    def _why_unheard(self, name: str) -> str:
+        """What the network refuses of a robot since it was heard last, if it does."""
+        before = self._refused_before.get(name, {})
+        counts = self._lanes[name].opener.refusals.as_dict()
+        since = {reason: count - before.get(reason, 0) for reason, count in counts.items()}
+        reason = max(since, key=lambda reason: since[reason], default="")
+        if not reason or since[reason] < REFUSED:
+            return ""
+        return f"what it sends is refused ({reason}){REMEDIES.get(reason, '')}"
+
     # -- on the network's threads -------------------------------------------------------------------------------------------
 
     def _on_observation(self, slot: Slot, message: Message) -> None:
         now = time.monotonic()
+        if (lane := self._lanes.get(slot.name)) is not None:
+            self._refused_before[slot.name] = lane.opener.refusals.as_dict()
         with self._news:
+            fitted = not slot.misfit
             if slot.observe(message.payload, self._robots.description, self.server, now):
                 self._news.notify_all()
+            elif fitted and slot.misfit:
+                self._robots.misfits(slot)
 
     def _on_weights(self, message: Message) -> bytes:
         asked, weights = unpack_weights(message.payload), self._weights
@@ -345,7 +384,7 @@ class RemoteFleet(Fleet):
         with self._news:
             names = slot.description.cameras if slot.description is not None else ()
             if camera in names:
-                slot.look(message.payload, names.index(camera), message.received)
+                slot.look(message.payload, camera, message.received)
             else:
                 slot.counts.add("camera")
 

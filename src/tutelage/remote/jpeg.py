@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tutelage.errors import MissingExtraError
-from tutelage.remote.messages import MAX_SIDE, Malformed
+from tutelage.remote.messages import MAX_PICTURE, MAX_SIDE, Malformed
 from tutelage.remote.wire import jpeg_size
 
 Array = NDArray[Any]
@@ -19,14 +19,21 @@ def encode(rgb: Array, quality: int = 80) -> bytes:
 
     Raises:
         MissingExtraError: OpenCV is not installed.
-        ValueError: it is no picture.
+        ValueError: it is no picture, or more than a message holds.
     """
     cv2 = _cv2()
+    if not isinstance(rgb, np.ndarray):
+        raise ValueError(f"a picture is (height, width, 3) uint8, not of type {type(rgb).__name__}")
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or not rgb.size or max(rgb.shape) > MAX_SIDE:
         raise ValueError(f"a picture is (height, width, 3) uint8, not {rgb.shape} {rgb.dtype}")
     done, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ValueError("OpenCV could not encode a picture")
+    if len(data) > MAX_PICTURE - 64:  # of a message; the rest is for its header
+        raise ValueError(
+            f"{len(data) / (1 << 20):.1f} MiB are too much for a picture, which has at most {MAX_PICTURE >> 20} MiB: "
+            "lower its size or --quality"
+        )
     return bytes(data)
 
 

@@ -23,13 +23,14 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tutelage.errors import ConfigError, TutelageError
+from tutelage.errors import ConfigError, ContractError, TutelageError
 from tutelage.remote import jpeg, topics
-from tutelage.remote.driver import Driver, describe, observation_of
+from tutelage.remote.driver import Driver, DriverFailed, describe, observation_of
 from tutelage.remote.eyes import Eyes
 from tutelage.remote.gate import CommandGate
 from tutelage.remote.latch import Latch
 from tutelage.remote.messages import Answer, Ask, Counts, Flag, Malformed, Observation, Operation, Order
+from tutelage.remote.telling import told
 from tutelage.remote.wire import pack_answer, pack_description, pack_observation, unpack_ask
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
@@ -47,12 +48,12 @@ WATCHED = 2.0
 PATIENCE = 2.0
 """Seconds for which a driver may fail without a break before the program ends."""
 
+RECOVERED = 0.5
+"""Seconds, or four timesteps, without a failure after which a driver is well again: one that fails at each action works in
+between, while it holds."""
+
 ANSWERS = 64
 """Resets that are recognised when they are asked for again."""
-
-
-class DriverFailed(TutelageError):
-    """The driver goes on failing; the robot was told to hold."""
 
 
 class OwnPolicy(Protocol):
@@ -123,6 +124,7 @@ class Robot:
         Raises:
             ConfigError: the node's policy has no robot of that name.
             ContractError: the driver breaks its contract.
+            DriverFailed: the driver cannot begin.
         """
         self.node, self.driver, self.config = node, driver, config or RobotConfig()
         self.policy = policy
@@ -149,16 +151,29 @@ class Robot:
         self._last_action: Array | None = None
         self._executed = (0, 0)  # server, number
         self._held = True
-        self._warned = False
+        self._warned = self._blocked = False
         self._told: Any = None
         self._told_at = float("-inf")
         self._failing_since: float | None = None
+        self._failed_at = float("-inf")
+        self._stops = 0
+        self._stopping = threading.Lock()  # a stop that is said again must not come after its end
+        self._owed: tuple[int | None, bool] | None = None  # seed, hard: of a reset that the emergency stop prevented
         self._obs: Array | None = None
+        self._seen_at = float("-inf")
         self._proposal: Array | None = None
-        self._version = 0
+        self._version = self._poor = 0
 
-        self._reset(self.config.seed, hard=False)
-        cameras = self._working_cameras()
+        try:
+            self._reset(self.config.seed, hard=False)
+            self._flags()
+            cameras = self._working_cameras()
+        except Exception as error:
+            with contextlib.suppress(Exception):
+                self._hold()
+            if isinstance(error, TutelageError):
+                raise
+            raise DriverFailed(f"the driver of {node.name} failed: {told(error)}") from error
         threaded = bool(getattr(driver, "threaded_cameras", False))
         self.eyes = Eyes(
             self.boot, cameras, {name: node.publisher(topics.alias(node.name, topics.PICTURE, name)) for name in cameras},
@@ -193,7 +208,7 @@ class Robot:
                 self._turn()
         finally:
             with contextlib.suppress(Exception):
-                self.driver.hold()
+                self._hold()
 
     def close(self) -> None:
         """End `run`, and leave the topics. The driver and the node stay open."""
@@ -241,19 +256,25 @@ class Robot:
 
     def _stop_now(self, first: bool) -> None:
         """On the stop lane's thread: nothing comes before this."""
+        failure = ""
         try:
             getattr(self.driver, "stop", self.driver.hold)()
-        except Exception:
-            log.exception("%s: the driver's emergency stop failed; it is called again", self.node.name)
+        except Exception as error:
+            failure = f"; the driver's stop failed and is called again: {told(error)}"
         if first:
-            self._report("emergency stop")
+            self._stops += 1
+            self._report(f"emergency stop{failure}")
         with self._news:
             self._news.notify_all()
 
     def _released(self) -> None:
-        with contextlib.suppress(Exception):
-            getattr(self.driver, "release", lambda: None)()
-        self._report("the emergency stop is cleared")
+        failure = ""
+        try:
+            with self._stopping:
+                getattr(self.driver, "release", lambda: None)()
+        except Exception as error:
+            failure = f", but the driver's release failed: {told(error)}"
+        self._report(f"the emergency stop is cleared{failure}")
 
     # -- the loop ----------------------------------------------------------------------------------------------------------
 
@@ -265,7 +286,11 @@ class Robot:
             now = time.monotonic()
             command = self.gate.current(now)
             if not self._held and command is None:
-                self._hold()
+                try:
+                    self._hold()
+                except Exception as error:
+                    self._failed(error)
+                    return
                 if self._obs is not None and self.gate.heard:
                     self._report(f"holds: no fresh command for {self.config.watchdog:g} s")
                 return
@@ -273,7 +298,8 @@ class Robot:
             due = began + self._dt * (EARLY if new else LATE if not self._held else 1.0)
             until = min(due, self.gate.until) if not self._held else due
             with self._news:
-                if (self._asked is not None and not stopped) or self.latch.stopped != stopped:
+                asked = self._asked is not None and not stopped and self._failing_since is None
+                if asked or self.latch.stopped != stopped:
                     return
                 again = self.gate.current(now)
                 if again is not command:
@@ -284,21 +310,28 @@ class Robot:
 
     def _turn(self) -> None:
         """One timestep: act or hold, look, tell."""
+        began = time.monotonic()
         try:
-            asked = self._asked
-            if asked is not None and not self.latch.stopped:
+            owed, asked = self._owed, self._asked
+            if (asked is not None or owed is not None) and not self.latch.stopped:
                 self._publish(self._flags() | Flag.RESETTING)
-                self._reset(asked.seed, hard=asked.operation == Operation.HARD_RESET)
+                seed, hard = owed or (None, False)
+                if asked is not None:
+                    seed, hard = asked.seed, hard or asked.operation == Operation.HARD_RESET
+                self._reset(seed, hard=hard)
                 with self._news:
                     if self._asked is asked:  # else a newer one came meanwhile; one that failed is tried again
                         self._asked = None
+                began = time.monotonic()  # a reset may take its time
             self._act()
             self._look()
-            self._failing_since = None
+            flags = self._flags()
         except Exception as error:
             self._failed(error)
             return
         now = time.monotonic()
+        if now - self._failed_at > max(RECOVERED, 4 * self._dt, 4 * self.gate.period):
+            self._failing_since = None
         if self.gate.period > 0.8 * self.config.watchdog and not self._warned:
             self._warned = True
             self._report(
@@ -307,21 +340,24 @@ class Robot:
             )
         watched = self.gate.watch if now - self.gate.heard_at < WATCHED else 0
         # A robot that is faster than its server need not tell it more often than twice a step, without news.
-        news = (self._executed, self._flags(), self._episode)
+        news = (self._executed, flags, self._episode)
         if news != self._told or now - self._told_at >= min(0.1, 0.5 * self.gate.period or 0.1) - 0.5 * self._dt:
             self._told, self._told_at = news, now
-            self._publish(self._flags())
+            self._publish(flags)
         self.eyes.look(watched, now)
+        took = time.monotonic() - began
+        if took > self.config.watchdog and not self._blocked:
+            self._blocked = True
+            self._report(
+                f"the driver (or a camera of it) took {took:.1f} s for a timestep, and could not be told to hold meanwhile; "
+                "all but reset() should return at once"
+            )
 
     def _act(self) -> None:
         command = self.gate.current(time.monotonic())
         if command is not None:
             self._executed = command.server, command.number
-        if self.latch.stopped:
-            getattr(self.driver, "stop", self.driver.hold)()
-            self._held, self._last_action = True, None
-            return
-        if command is None or not command.order & Order.ACT or self._over():
+        if self.latch.stopped or command is None or not command.order & Order.ACT or self._over():
             self._hold()
             return
         wanted = self._proposal if command.order & Order.OWN else command.action
@@ -329,14 +365,17 @@ class Robot:
             self._hold()
             return
         action = self._bounded(wanted)
+        held, self._held = self._held, False  # if it fails, the robot may be moving
         self.driver.send_action(action)
-        if self.latch.stopped:  # while the action was being sent: the stop must be the last word
-            getattr(self.driver, "stop", self.driver.hold)()
-        if self._held:
+        self._stop_again()  # if it came while the action was being sent
+        if held:
             self._report("moves")
-        self._held, self._last_action = False, action
+        self._last_action = action
         self._step += 1
-        self._return += float(getattr(self.driver, "reward", float)())
+        reward = float(getattr(self.driver, "reward", float)())
+        if not np.isfinite(reward):
+            raise ContractError(f"{type(self.driver).__name__}.reward() must be a finite number, got {reward!r}")
+        self._return += reward
 
     def _bounded(self, action: Array) -> Array:
         bounded = np.clip(action, self._low, self._high)
@@ -348,15 +387,42 @@ class Robot:
         return np.asarray(bounded, dtype=np.float32)
 
     def _hold(self) -> None:
+        """Stand still. A robot that is stopped hears of nothing but the stop."""
         self._held, self._last_action = True, None
-        self.driver.hold()
+        if not self.latch.stopped:
+            self.driver.hold()
+        self._stop_again()
+
+    def _stop_again(self) -> None:
+        """The emergency stop is the last word, whatever the driver was told while it came."""
+        if self.latch.stopped:
+            with self._stopping:
+                if self.latch.stopped:
+                    getattr(self.driver, "stop", self.driver.hold)()
 
     def _look(self) -> None:
+        seen_at = time.monotonic()  # before whatever takes its time: from here on the observation grows old
         self._obs = observation_of(self.driver)
+        self._seen_at = seen_at
         self._proposal, self._version = None, 0
         if self.policy is not None and self.policy.version:
             self._version = self.policy.version
-            self._proposal = self._bounded(np.asarray(self.policy.act(self._obs[None])[0], np.float32))
+            self._proposal = self._propose(self._obs)
+
+    def _propose(self, obs: Array) -> Array | None:
+        """What the policy on the robot would do; None: nothing that could be done."""
+        assert self.policy is not None
+        try:
+            action = np.asarray(self.policy.act(obs[None])[0], np.float32)
+            if action.shape == self._low.shape and np.isfinite(action).all():
+                return self._bounded(action)
+            why = f"{action.tolist()} is no action" if action.size < 20 else f"{action.shape} numbers are no action"
+        except Exception as error:
+            why = told(error)
+        if self._poor != self._version:
+            self._poor = self._version
+            self._report(f"the policy on the robot is of no use: {why}; the server decides")
+        return None
 
     def _over(self) -> bool:
         """Has the episode ended? Then the robot stands still until it is reset."""
@@ -365,31 +431,36 @@ class Robot:
     def _reset(self, seed: int | None, *, hard: bool) -> None:
         """Begin an episode: at the start of the program, or when the server asks."""
         self._hold()
-        reset = getattr(self.driver, "reset", None)
-        if reset is not None and not self.latch.stopped:
-            reset(hard, seed)
+        reset, stops = getattr(self.driver, "reset", None), self._stops
+        if reset is not None:
+            self._owed = seed, hard
+            if not self.latch.stopped:
+                reset(hard, seed)
+                if stops == self._stops and not self.latch.stopped:  # else who knows how far it got
+                    self._owed = None
         self._episode += 1
         self._step, self._return = 0, 0.0
         self._look()
         if self._episode > 1:
             self._report(f"episode {self._episode} begins after a {'hard' if hard else 'soft'} reset")
         with self._news:
-            self.gate.observed(self._number + 1, time.monotonic(), new_episode=True)
+            self.gate.observed(self._number + 1, self._seen_at, new_episode=True)
 
     def _failed(self, error: Exception) -> None:
-        now = time.monotonic()
+        with contextlib.suppress(Exception):
+            self._hold()  # before anything else
+        now = self._failed_at = time.monotonic()
         if self._failing_since is None:
             self._failing_since = now
-            self._report(f"the driver failed: {type(error).__name__}: {error}")
-            log.warning("%s: the driver failed", self.node.name, exc_info=error)
-        with contextlib.suppress(Exception):
-            self._hold()
-        self._held = True
+            self._report(f"the driver failed: {told(error)}")
+            log.info("%s: the driver failed", self.node.name, exc_info=error)
         if now - self._failing_since > PATIENCE:
-            raise DriverFailed(f"the driver of {self.node.name} goes on failing: {type(error).__name__}: {error}") from error
+            raise DriverFailed(f"the driver of {self.node.name} goes on failing: {told(error)}") from error
         if self._obs is not None:
-            with contextlib.suppress(Exception):
-                self._publish(self._flags() | Flag.FAULT)
+            flags = Flag.HELD | Flag.STOPPED if self.latch.stopped else Flag.HELD
+            with contextlib.suppress(Exception):  # they are the driver's, too
+                flags = self._flags()
+            self._publish(flags | Flag.FAULT)
 
     def _flags(self) -> Flag:
         flags = Flag(0)
@@ -408,7 +479,7 @@ class Robot:
         now = time.monotonic()
         with self._news:
             self._number += 1
-            self.gate.observed(self._number, now)
+            self.gate.observed(self._number, self._seen_at)
             gate, stale = self.gate, self.gate.counts["stale"]
             message = Observation(
                 self.boot, self._number, self._episode, self._step, flags, gate.server, gate.heard,
@@ -435,9 +506,10 @@ class Robot:
             try:
                 if not jpeg.available():
                     raise ConfigError("OpenCV is not installed; run: pip install 'tutelage[remote]'")
-                jpeg.encode(grab())
+                if self._owed is None:  # else nothing may be there to be seen before the reset
+                    jpeg.encode(grab(), self.config.quality)
             except Exception as error:
-                self._report(f"camera {name} gives no picture, and is left out: {error}")
+                self._report(f"camera {name} gives no picture, and is left out: {told(error)}")
             else:
                 working[name] = grab
         return working

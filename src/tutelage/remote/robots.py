@@ -7,14 +7,15 @@ import logging
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tutelage.errors import ConfigError
+from tutelage.errors import ConfigError, TutelageError
 from tutelage.files import write_atomic
-from tutelage.remote.messages import Description, Flag, Malformed
+from tutelage.remote.messages import MAX_CAMERAS, Description, Flag, Malformed
 from tutelage.remote.slot import Slot
 
 log = logging.getLogger(__name__)
@@ -67,15 +68,23 @@ class Robots:
             self.description = said
             for other in self.slots:
                 other.settle_on(said)
-            write_atomic(self._file, (json.dumps(said.to_json(), indent=1) + "\n").encode())
+            self._remember()
         if said.matches(self.description):
             slot.description = said
+            more = tuple(name for name in said.cameras if name not in self.description.cameras)
+            if more and len(self.description.cameras) + len(more) <= MAX_CAMERAS:  # the first one lacked a camera, perhaps
+                self.description = replace(self.description, cameras=self.description.cameras + more)
+                self._remember()
         else:
             slot.misfit = _difference(said, self.description)
-            log.warning(
-                "%s does not fit into this fleet: %s; if the fleet is another one now, remove %s",
-                slot.name, slot.misfit, self._file,
-            )  # fmt: skip
+            self.misfits(slot)
+
+    def misfits(self, slot: Slot) -> None:
+        """Say that a robot does not fit, and what to do."""
+        log.warning("%s does not fit into this fleet: %s", slot.name, self._says(slot))
+
+    def _says(self, slot: Slot) -> str:
+        return f"{slot.misfit}; if the fleet is another one now, remove {self._file}" if slot.misfit else ""
 
     def known(self, wait: float) -> Description:
         """What robots are, as soon as one has said so.
@@ -113,7 +122,7 @@ class Robots:
                         "stale": seen.stale if seen is not None else 0,
                         "refused_there": seen.refused if seen is not None else 0,
                         "refused_here": dict(slot.counts.by_reason),
-                        "says": slot.misfit,
+                        "says": self._says(slot),
                     }
                 )
             return rows
@@ -126,6 +135,13 @@ class Robots:
                 for reason, count in slot.counts.by_reason.items():
                     total[reason] = total.get(reason, 0) + count
         return total
+
+    def _remember(self) -> None:
+        assert self.description is not None
+        try:
+            write_atomic(self._file, (json.dumps(self.description.to_json(), indent=1) + "\n").encode())
+        except TutelageError as error:  # the disk is full, for instance
+            log.warning("the next server will have to ask the robots what they are: %s", error)
 
     def _remembered(self) -> Description | None:
         try:

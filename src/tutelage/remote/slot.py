@@ -39,7 +39,7 @@ class Slot:
         starts: how often it was switched on while we listened.
         was_online: what the loop was told last.
         asking, ask_at, stop_at: is it being asked something, when to ask next, and when it was last told to stop or go on.
-        pictures: the newest of each camera, and when it came in seconds since 1970.
+        pictures: the newest of each camera, by name, and when it came in seconds since 1970.
     """
 
     def __init__(self, name: str) -> None:
@@ -56,12 +56,12 @@ class Slot:
         self.counts = Counts()
         self.round_trip = float("nan")
         self.starts = 0
-        self.pictures: dict[int, tuple[float, Picture]] = {}
+        self.pictures: dict[str, tuple[float, Picture]] = {}
         self.asking = self.was_online = False
         self.ask_at = self.stop_at = float("-inf")
         self._past: deque[int] = deque(maxlen=64)
         self._sent: OrderedDict[int, float] = OrderedDict()
-        self._watched: dict[int, float] = {}
+        self._watched: dict[str, float] = {}
         self._answered = 0
 
     # -- what comes -------------------------------------------------------------------------------------------------------
@@ -110,8 +110,8 @@ class Slot:
         if seen.boot != answer.boot or seen.episode > answer.episode:
             self.reset, self.accepted = "", None
 
-    def look(self, data: bytes, camera: int, now: float) -> bool:
-        """A picture came on the topic of a camera (its index; now in seconds since 1970). Was it taken?"""
+    def look(self, data: bytes, camera: str, now: float) -> bool:
+        """A picture came on the topic of a camera (its name; now in seconds since 1970). Was it taken?"""
         try:
             picture = unpack_picture(data)
         except Malformed:
@@ -157,13 +157,14 @@ class Slot:
         while len(self._sent) > 256:
             self._sent.popitem(last=False)
 
-    def watch(self, camera: int, now: float) -> None:
-        """Somebody looks at a camera."""
+    def watch(self, camera: str, now: float) -> None:
+        """Somebody looks at a camera (its name)."""
         self._watched[camera] = now
 
     def watched(self, now: float) -> int:
-        """The cameras that somebody looks at, a bit each."""
-        return sum(1 << camera for camera, when in self._watched.items() if now - when < WATCHING)
+        """The cameras that somebody looks at, a bit each, in the robot's own order: it may lack one that others have."""
+        names = self.description.cameras if self.description is not None else ()
+        return sum(1 << k for k, name in enumerate(names) if now - self._watched.get(name, float("-inf")) < WATCHING)
 
     def settle_on(self, fleet: Description) -> None:
         """It is known now what robots of this fleet are: what came before may not fit."""

@@ -33,6 +33,7 @@ from tutelage.policies.ensemble import EnsemblePolicy
 from tutelage.remote import topics
 from tutelage.remote.fleet import RemoteFleet
 from tutelage.remote.messages import Weights
+from tutelage.remote.telling import told
 from tutelage.remote.wire import pack_weights, unpack_weights
 from tutelage.sgc.node import Node
 
@@ -87,12 +88,13 @@ class SharedPolicy:
 
     def share(self) -> None:
         """Hand out the present weights."""
-        self.version += 1
+        self._shared_at = time.monotonic()
+        version = self.version + 1
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "policy.safetensors"
-            self.policy.save(path, {"version": self.version})
-            self.fleet.offer_policy(Weights(self.version, path.read_bytes()))
-        self._shared_at, self._changed = time.monotonic(), False
+            self.policy.save(path, {"version": version})
+            self.fleet.offer_policy(Weights(version, path.read_bytes()))
+        self.version, self._changed = version, False
 
     def on_start(self, loop: Loop) -> None:
         """Nothing to do."""
@@ -101,7 +103,10 @@ class SharedPolicy:
         """Hand out new weights after something was learned."""
         self._changed |= bool(step.losses)
         if self._changed and time.monotonic() - self._shared_at >= SHARE_EVERY:
-            self.share()
+            try:
+                self.share()
+            except (TutelageError, OSError) as error:  # the disk is full, for instance; robots go on with what they have
+                log.warning("the robots do not get the newest weights yet: %s", told(error))
 
     def on_end(self, loop: Loop) -> None:
         """Hand out what was learned last."""
@@ -121,6 +126,7 @@ class PulledPolicy:
         self.node = node
         EnsemblePolicy(1, np.array([-1.0]), np.array([1.0]), members=1)  # compiles, or loads what is: before the robot moves
         self._now: tuple[int, EnsemblePolicy | None] = (0, None)
+        self._trouble = ""
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._fetch, name="robot-policy", daemon=True)
         self._thread.start()
@@ -160,6 +166,12 @@ class PulledPolicy:
                 self._take(unpack_weights(self.node.request(topics.WEIGHTS, asked, 3.0)))
             except TutelageError as error:
                 log.info("%s: %s", self.node.name, error)
+            except Exception as error:  # a disk that is full, a damaged file: the next ones may be good
+                if self._trouble != told(error):
+                    self._trouble = told(error)
+                    log.warning("%s goes on with the policy that it has: %s", self.node.name, self._trouble)
+            else:
+                self._trouble = ""
             self._closed.wait(FETCH_EVERY)
 
     def _take(self, weights: Weights) -> None:
