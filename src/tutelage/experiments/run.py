@@ -112,6 +112,7 @@ class Run:
         _check_vacant(folder)  # another process may have made and left a run while this one assembled
         assembly = prepare(assembly, report)
         run = cls(folder, assembly, claim)
+        run.recorder.cut(0)  # a folder without a configuration may hold the recordings of another run
         run.checkpoints.save(run.loop)
         write_atomic(folder / "environment.txt", environment().encode())
         # Written last: a folder with a configuration is one that can be continued.
@@ -163,8 +164,10 @@ def read_config(folder: Path) -> RunConfig:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         found = values.pop("format")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise RunFolderError(f"{folder} holds no run (no config.json); start one with: tutelage run") from None
+    except PermissionError as error:
+        raise RunFolderError(f"cannot read {path}: {error.strerror}") from None
     except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError):
         raise RunFolderError(f"{path} is damaged; restore it, or start a new run in another folder") from None
     if found != FORMAT:
