@@ -379,7 +379,12 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["run", "Walker2d", "--out", "garbage"], "cannot write to garbage: File exists; choose another folder"),
         (["resume", "lost"], "lost holds no run (no config.json); start one with: tutelage run"),
         (["resume", "."], ". holds no run (no config.json); start one with: tutelage run"),
-        (["resume", "garbage"], "garbage/config.json is damaged; restore it, or start a new run in another folder"),
+        (["resume", "garbage"], "garbage holds no run (no config.json); start one with: tutelage run"),
+        (["check", "policy", "mine"], "policy 'mine': write module:callable, such as my_package.robots:make_fleet"),
+        (
+            ["run", "Walker2d", "--robots", "1000000000000"],
+            "not enough memory: Unable to allocate *; choose fewer robots, *",
+        ),
         (["evaluate", "lost"], "lost holds no run (no config.json); start one with: tutelage run"),
         (["report", "lost"], "lost is not a run folder: no such folder; give a folder that `tutelage run` wrote"),
         (["report", "."], ". is not a run folder: it has no config.json; give a folder that `tutelage run` wrote"),

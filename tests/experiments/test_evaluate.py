@@ -74,7 +74,7 @@ def test_help_by_a_priority_of_ones_own(folder: Path, tmp_path: Path) -> None:
     assert result["teleoperation"] > 0, "with the critic of C.U.R., and a low threshold"
     run = Run.start(points(tmp_path / "run", priority="C."))
     run.run()
-    with pytest.raises(ConfigError, match="this run did not learn risk, which small:Worry looks at"):
+    with pytest.raises(ConfigError, match=r"not learn risk, which small:Worry looks at; evaluate it with C\. or U\.C\.$"):
         evaluate_run(run.folder, 40, "small:Worry")
 
 

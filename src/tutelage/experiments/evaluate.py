@@ -57,9 +57,10 @@ def evaluate_policy(
         try:
             assembly.learner.load_state_dict((learned or {})["learner"])
         except KeyError:
+            able = list(dict.fromkeys(name for name in (config.priority, "U.C.", "C.") if name != priority))
             raise ConfigError(
                 f"this run did not learn {', '.join(sorted(wanted))}, which {priority} looks at; evaluate it with "
-                f"{config.priority}, U.C. or C."
+                f"{', '.join(able[:-1])} or {able[-1]}"
             ) from None
     tally = tally or Tally(config.robots, config.humans)
     loop = assembly.loop(frozen=assembly.human if policy is None else policy)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -111,8 +111,15 @@ def load_run(path: Path | str) -> RunRecord:
     return RunRecord(path, config, metrics, log, evaluation)
 
 
-def run_folders(paths: Sequence[Path | str]) -> list[Path]:
+def run_folders(paths: Sequence[Path | str], say: Callable[[str], None] = lambda line: None) -> list[Path]:
     """The run folders that are meant: each path itself, or those in it. What a report left beside them is passed over.
+
+    Of several, so are folders that hold no run, such as that of an expert or of a run in preparation, and runs without a
+    line of metrics.
+
+    Args:
+        paths: as a user names them.
+        say: told what was passed over, if it is not a report's.
 
     Raises:
         RunFolderError: a path is no run folder, and holds none.
@@ -125,7 +132,22 @@ def run_folders(paths: Sequence[Path | str]) -> list[Path]:
                 continue
             within = [path]
         found |= dict.fromkeys(within)
+    reasons = {path: reason for path in found if (reason := _nothing_in(path))}
+    if 0 < len(reasons) < len(found):
+        for path, reason in reasons.items():
+            del found[path]
+            say(f"passed over {path}: {reason}")
     return list(found)
+
+
+def _nothing_in(folder: Path) -> str:
+    """Why there is nothing to report of a folder yet; empty if there is, or something is wrong with it."""
+    if not folder.is_dir():
+        return ""
+    if not (folder / "config.json").exists():
+        return "it holds no run"
+    lines = folder / "metrics.jsonl"
+    return "it has not completed a step yet" if lines.is_file() and not lines.stat().st_size else ""
 
 
 def _holds_only(folder: Path, name: str) -> bool:
