@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,14 @@ def test_a_folder_without_a_run_or_without_a_policy_is_refused(tmp_path: Path) -
     with pytest.raises(TutelageError, match="no such file: .*policy.safetensors"):
         evaluate_run(run.folder, 20)
     assert not (run.folder / "evaluation.json").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_evaluation(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(RunFolderError, match="cannot write to .*, where the result goes; evaluate a copy of it"):
+        evaluate_run(folder, 20, subscribers=[object()])  # type: ignore[list-item]
 
 
 def test_any_policy_can_be_evaluated_from_python(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import json
 import math
+import os
 import re
 import sqlite3
 from pathlib import Path
@@ -254,6 +255,16 @@ def test_of_several_folders_those_without_a_run_are_passed_over(run: Path, tmp_p
     assert run_folders([tmp_path / "expert"]) == [tmp_path / "expert"], "alone it is refused, when it is read"
     with pytest.raises(RunFolderError, match="no such folder"):
         load_runs(run_folders([run, tmp_path / "lost"]))
+
+
+@pytest.mark.parametrize("others", [(), ("other",)])
+def test_a_folder_that_may_not_be_read_is_refused(run: Path, tmp_path: Path, others: tuple[str, ...]) -> None:
+    beside = [write_run(tmp_path / name) for name in others]
+    run.chmod(0)
+    if os.access(run, os.X_OK):
+        pytest.skip("an administrator may read everything")
+    with pytest.raises(RunFolderError, match="cannot read .*run: Permission denied"):
+        load_runs(run_folders([*beside, run]))
 
 
 # -- statistics -----------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -92,7 +93,9 @@ def load_run(path: Path | str) -> RunRecord:
         RunFolderError: it is not a run folder, or a file in it is missing, damaged or of another schema.
     """
     path = Path(path)
-    if not (path / "config.json").is_file():
+    if not os.path.isfile(path / "config.json"):  # unlike a Path's, it says no where nothing may be read
+        if path.is_dir() and not os.access(path, os.X_OK):
+            raise RunFolderError(f"cannot read {path}: Permission denied")
         reason = "it has no config.json" if path.is_dir() else "no such folder"
         raise RunFolderError(f"{path} is not a run folder: {reason}; give a folder that `tutelage run` wrote")
     config = _object(path / "config.json", _parse(path / "config.json", _text(path / "config.json")))
@@ -127,7 +130,7 @@ def run_folders(paths: Sequence[Path | str], say: Callable[[str], None] = lambda
     found: dict[Path, None] = {}
     for path in map(Path, paths):
         within = [one.parent for one in sorted(path.glob("*/config.json"))]
-        if (path / "config.json").is_file() or not within:
+        if os.path.isfile(path / "config.json") or not within:
             if len(paths) > 1 and (path.name == "report.html" or _holds_only(path, "curves.png")):
                 continue
             within = [path]
@@ -142,7 +145,7 @@ def run_folders(paths: Sequence[Path | str], say: Callable[[str], None] = lambda
 
 def _nothing_in(folder: Path) -> str:
     """Why there is nothing to report of a folder yet; empty if there is, or something is wrong with it."""
-    if not folder.is_dir():
+    if not folder.is_dir() or not os.access(folder, os.X_OK):
         return ""
     if not (folder / "config.json").exists():
         return "it holds no run"
@@ -151,7 +154,7 @@ def _nothing_in(folder: Path) -> str:
 
 
 def _holds_only(folder: Path, name: str) -> bool:
-    return folder.is_dir() and [entry.name for entry in folder.iterdir()] == [name]
+    return folder.is_dir() and os.access(folder, os.R_OK) and [entry.name for entry in folder.iterdir()] == [name]
 
 
 def load_runs(paths: Sequence[Path | str]) -> list[RunRecord]:
