@@ -379,7 +379,11 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
         (["run", "Walker2d", "--out", "garbage"], "cannot write to garbage: File exists; choose another folder"),
         (["resume", "lost"], "lost holds no run (no config.json); start one with: tutelage run"),
         (["resume", "."], ". holds no run (no config.json); start one with: tutelage run"),
-        (["resume", "garbage"], "garbage/config.json is damaged; restore it, or start a new run in another folder"),
+        (["resume", "garbage"], "garbage holds no run (no config.json); start one with: tutelage run"),
+        (
+            ["run", "Walker2d", "--robots", "1000000000000"],
+            "not enough memory: Unable to allocate *",
+        ),
         (["evaluate", "lost"], "lost holds no run (no config.json); start one with: tutelage run"),
         (["report", "lost"], "lost is not a run folder: no such folder; give a folder that `tutelage run` wrote"),
         (["report", "."], ". is not a run folder: it has no config.json; give a folder that `tutelage run` wrote"),
@@ -404,7 +408,7 @@ def test_what_cannot_be_parsed_is_one_line_that_names_it(
             "PPO needs rollout, epochs, minibatch and hidden widths of at least 1",
         ),
         (["check", "env", "Wlker2d"], "unknown task 'Wlker2d' (did you mean Walker2d?); tasks: *"),
-        (["check", "policy", "test_cli"], "policy 'test_cli': module 'test_cli' has no callable ''"),
+        (["check", "policy", "test_cli"], "policy 'test_cli': write module:callable, such as my_package.robots:make_fleet"),
         (["check", "policy", "test_cli:Undecided"], "Undecided is no policy; it needs act(obs)"),
         (["check", "supervisor", "test_cli:Undecided"], "Undecided is no supervisor; it needs act(obs, robots)"),
         (

@@ -118,7 +118,7 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
     """Curves, tables and one self-contained HTML page of one run, or of many with means and 95 % bands.
 
     Args:
-        runs: run folders; or folders of run folders.
+        runs: run folders; or folders of run folders. Of several, those without a run are passed over.
         out: where the page goes, a file.html or a folder; default: report.html in the only run, or in the folder that holds
             them all.
     """
@@ -127,7 +127,7 @@ def report(runs: Positional[list[Path]], out: Path | None = None) -> None:
 
     if not runs:
         raise ConfigError("name at least one run folder, such as: tutelage report runs/*")
-    folders = run_folders(runs)
+    folders = run_folders(runs, lambda line: console.print(line, highlight=False, soft_wrap=True))
     console.print(summary_table(load_runs(folders)), highlight=False, markup=False, soft_wrap=True)
     page = write_report(folders, out or (runs[0] if len(runs) == 1 else runs[0].parent))
     console.print(f"report: {page}", highlight=False, soft_wrap=True)
@@ -376,6 +376,12 @@ def main(args: Sequence[str] | None = None) -> None:
         sys.stdout.flush()
     except TutelageError as error:
         print(f"tutelage: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "can't allocate memory" not in str(error):  # PyTorch's own kind
+            raise
+        reason = (str(error).splitlines() or ["no more is left"])[0]
+        print(f"tutelage: not enough memory: {reason}; choose fewer robots, smaller networks or less data", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("tutelage: interrupted", file=sys.stderr)

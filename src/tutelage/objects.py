@@ -17,6 +17,8 @@ def load_object(name: str, what: str) -> Callable[..., Any]:
         ConfigError: no such module, or no such callable in it.
     """
     module, _, attribute = name.partition(":")
+    if not attribute:
+        raise ConfigError(f"{what} {name!r}: write module:callable, such as my_package.robots:make_fleet")
     try:
         found: Any = importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def test_help_by_a_priority_of_ones_own(folder: Path, tmp_path: Path) -> None:
     assert result["teleoperation"] > 0, "with the critic of C.U.R., and a low threshold"
     run = Run.start(points(tmp_path / "run", priority="C."))
     run.run()
-    with pytest.raises(ConfigError, match="this run did not learn risk, which small:Worry looks at"):
+    with pytest.raises(ConfigError, match=r"not learn risk, which small:Worry looks at; evaluate it with C\. or U\.C\.$"):
         evaluate_run(run.folder, 40, "small:Worry")
 
 
@@ -126,6 +127,14 @@ def test_a_folder_without_a_run_or_without_a_policy_is_refused(tmp_path: Path) -
     with pytest.raises(TutelageError, match="no such file: .*policy.safetensors"):
         evaluate_run(run.folder, 20)
     assert not (run.folder / "evaluation.json").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_evaluation(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(RunFolderError, match="cannot write to .*, where the result goes; evaluate a copy of it"):
+        evaluate_run(folder, 20, subscribers=[object()])  # type: ignore[list-item]
 
 
 def test_any_policy_can_be_evaluated_from_python(tmp_path: Path) -> None:

@@ -163,6 +163,21 @@ def test_frames_of_later_timesteps_are_cut_with_their_files(tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == ["steps-00000000-00000010.parquet"]
 
 
+def test_files_of_other_names_are_not_cut(tmp_path: Path) -> None:
+    (tmp_path / "steps-mine.parquet").write_bytes(b"")
+    EpisodeFrames(tmp_path, "all", 4).cut(0)
+    assert (tmp_path / "steps-mine.parquet").exists()
+
+
+def test_a_commit_brings_events_into_the_file_itself(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    recorder, _ = recorded(tmp_path / "run", 20)  # SQLite syncs its log when it empties it, and not before
+    (tmp_path / "alone.sqlite").write_bytes((tmp_path / "run" / "events.sqlite").read_bytes())
+    with closing(sqlite3.connect(tmp_path / "alone.sqlite")) as database:
+        count = database.execute("SELECT COUNT(*) FROM events").fetchone()[0]
+    assert count == recorder.events.written > 0
+
+
 def test_the_state_of_a_recorder_is_restored(tmp_path: Path) -> None:
     for name in ("one", "other"):
         (tmp_path / name).mkdir()

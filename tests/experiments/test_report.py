@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import json
 import math
+import os
 import re
 import sqlite3
 from pathlib import Path
@@ -17,7 +18,7 @@ from fakes import FakeLearner, PointFleet, make_loop
 from tutelage.errors import MissingExtraError, RunFolderError
 from tutelage.experiments import plots
 from tutelage.experiments.recording import Recorder
-from tutelage.experiments.records import load_run, load_runs
+from tutelage.experiments.records import load_run, load_runs, run_folders
 from tutelage.experiments.report import differences, summary_table, write_report
 from tutelage.fleet.attempts import attempts, request_rate
 from tutelage.fleet.events import Events
@@ -240,6 +241,32 @@ def test_paths_that_are_not_run_folders_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "report.html").exists()
 
 
+def test_of_several_folders_those_without_a_run_are_passed_over(run: Path, tmp_path: Path) -> None:
+    for name in ("expert", "young"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "young" / "config.json").write_text("{}")
+    (tmp_path / "young" / "metrics.jsonl").write_text("")
+    told: list[str] = []
+    assert run_folders([tmp_path / "expert", run, tmp_path / "young"], told.append) == [run]
+    assert told == [
+        f"passed over {tmp_path / 'expert'}: it holds no run",
+        f"passed over {tmp_path / 'young'}: it has not completed a step yet",
+    ]
+    assert run_folders([tmp_path / "expert"]) == [tmp_path / "expert"], "alone it is refused, when it is read"
+    with pytest.raises(RunFolderError, match="no such folder"):
+        load_runs(run_folders([run, tmp_path / "lost"]))
+
+
+@pytest.mark.parametrize("others", [(), ("other",)])
+def test_a_folder_that_may_not_be_read_is_refused(run: Path, tmp_path: Path, others: tuple[str, ...]) -> None:
+    beside = [write_run(tmp_path / name) for name in others]
+    run.chmod(0)
+    if os.access(run, os.X_OK):
+        pytest.skip("an administrator may read everything")
+    with pytest.raises(RunFolderError, match="cannot read .*run: Permission denied"):
+        load_runs(run_folders([*beside, run]))
+
+
 # -- statistics -----------------------------------------------------------------------------------------------------------
 
 
@@ -297,6 +324,12 @@ def test_a_single_run_has_no_interval(run: Path) -> None:
 def test_differences_of_configurations(many: list[Path]) -> None:
     assert differences(load_runs(many)) == {"seed": ["0, 1, 2", "0, 1, 2"], "learner.batch": ["64", "256"]}
     assert differences(load_runs(many[:1])) == {}
+
+
+def test_thresholds_that_differ_are_short_unless_they_look_alike(tmp_path: Path) -> None:
+    numbers = {"a": (0.004543168004602194, 0.05), "b": (0.005646437406539917, 0.050001)}
+    runs = [write_run(tmp_path / name, u=u, r=r) for name, (u, r) in numbers.items()]
+    assert differences(load_runs(runs)) == {"u": ["0.004543, 0.005646"], "r": ["0.05, 0.050001"]}
 
 
 # -- pages ------------------------------------------------------------------------------------------------------------------

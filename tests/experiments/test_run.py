@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -149,10 +150,13 @@ def test_demonstrations_are_as_many_pairs_as_asked_for_of_the_expert_in_calm() -
     assert (obs[0] != obs[750]).any(), "two episodes of 750 pairs"
 
 
-def test_an_expert_that_falls_cannot_demonstrate(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("level", "mend"), [("none", "name a better one: --expert"), ("strong", "choose a calmer level: --offline-disturbance")]
+)
+def test_an_expert_that_falls_cannot_demonstrate(tmp_path: Path, level: str, mend: str) -> None:
     GaussianActor(17, np.full(6, -1.0), np.full(6, 1.0), (4,)).save(tmp_path / "clumsy", {"task": "Walker2d"})
-    with pytest.raises(ConfigError, match="the expert fell in 3 of 3 demonstrations; choose a calmer level"):
-        Run.start(walker(tmp_path / "run", expert=str(tmp_path / "clumsy")))
+    with pytest.raises(ConfigError, match=f"the expert fell in 3 of 3 demonstrations; {mend}"):
+        Run.start(walker(tmp_path / "run", expert=str(tmp_path / "clumsy"), offline_disturbance=level))
     with pytest.raises(RunFolderError, match="holds no run"):
         read_config(tmp_path / "run")
 
@@ -325,6 +329,23 @@ def damage(folder: Path, what: str) -> None:
         edit_config(folder, format=0)
     elif what == "events":
         (folder / "events.sqlite").write_bytes(b"garbage" * 100)
+    elif what == "no events":
+        (folder / "events.sqlite").unlink()
+    elif what == "page of events":
+        content = bytearray((folder / "events.sqlite").read_bytes())
+        content[4096:] = b"\xff" * len(content[4096:])
+        (folder / "events.sqlite").write_bytes(content)
+    elif what == "no metrics":
+        (folder / "metrics.jsonl").unlink()
+    elif what == "line of metrics":
+        lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+        (folder / "metrics.jsonl").write_text("".join([*lines[:2], "}{", *lines[2:]]))
+    elif what == "metrics are a folder":
+        (folder / "metrics.jsonl").unlink()
+        (folder / "metrics.jsonl").mkdir()
+    elif what == "episodes are a file":
+        shutil.rmtree(folder / "episodes")
+        (folder / "episodes").write_text("")
     else:
         edit_config(folder, **json.loads(what))
 
@@ -355,6 +376,15 @@ FITS_NOT = f"{STATE} does not fit {CONFIG}: one of them is damaged or was change
         ('{"robots": "six"}', "a setting has the wrong kind: robots cannot be 'six'"),
         ('{"humans": 9}', "9 humans for 6 robots: use at most one human a robot (M <= N)"),
         ("events", "cannot open {folder}/events.sqlite: file is not a database; restore the file or start a new run"),
+        ("no events", "{folder}/events.sqlite is damaged: 0 readable entries before timestep 30, and "),
+        ("page of events", "events.sqlite is damaged: "),
+        (
+            "no metrics",
+            "{folder}/metrics.jsonl is damaged: 0 readable entries before timestep 30, and 6 were written; restore",
+        ),
+        ("line of metrics", "{folder}/metrics.jsonl is damaged: 2 readable entries before timestep 30, and 6 were written"),
+        ("metrics are a folder", "cannot open {folder}/metrics.jsonl: Is a directory; restore it or start a new run"),
+        ("episodes are a file", "cannot write to {folder}/episodes: File exists; restore it or start a new run"),
     ],
 )
 def test_a_damaged_folder_is_refused_in_one_line(ended: Path, what: str, message: str) -> None:
@@ -363,6 +393,33 @@ def test_a_damaged_folder_is_refused_in_one_line(ended: Path, what: str, message
         Run.resume(ended)
     assert str(caught.value).startswith(message.format(folder=ended))
     assert "\n" not in str(caught.value)
+
+
+def test_a_refusal_to_resume_changes_no_recording(ended: Path) -> None:
+    damage(ended, "line of metrics")
+    before = contents(ended)
+    with pytest.raises(RunFolderError):
+        Run.resume(ended)
+    assert contents(ended) == before
+
+
+def test_a_checkpoint_that_does_not_say_how_much_was_written_is_continued(ended: Path) -> None:
+    state, before = ended / "checkpoint" / "state.safetensors", contents(ended)
+    tree = load_tree(state)
+    del tree["recorder"]["written"]
+    save_tree(state, tree)
+    Run.resume(ended).run()
+    assert contents(ended) == before
+
+
+def test_a_run_that_starts_among_recordings_of_another_one_is_refused_and_changes_none(ended: Path) -> None:
+    (ended / "config.json").unlink()
+    before = contents(ended)
+    with pytest.raises(
+        RunFolderError, match="holds the recordings of a run without its config.json; restore that, or choose"
+    ):
+        Run.start(walker(ended))
+    assert contents(ended) == before
 
 
 def test_a_refused_folder_can_be_mended_and_continued(ended: Path) -> None:

@@ -14,7 +14,8 @@ import torch
 from fakes import ELAPSED, EPISODE, POSITION, PointFleet
 
 from tutelage.envs import experts
-from tutelage.errors import ConfigError, ContractError, TutelageError
+from tutelage.errors import ConfigError, ContractError, RunFolderError, TutelageError
+from tutelage.experiments.recording import lock
 from tutelage.experiments.train_expert import ExpertConfig, train
 from tutelage.learning.ppo import PPO, PPOConfig, RunningMoments
 from tutelage.policies.expert import GaussianActor
@@ -265,6 +266,7 @@ def test_training_leaves_weights_with_a_card(tmp_path: Path, monkeypatch: pytest
     path = train(expert(tmp_path, 512), said.append)
     assert path == tmp_path / "Walker2d.safetensors"
     assert sorted(file.name for file in tmp_path.iterdir()) == [
+        ".lock",
         "Walker2d.safetensors",
         "best.safetensors",
         "ppo.safetensors",
@@ -305,6 +307,14 @@ def test_training_that_is_over_is_scored_again(tmp_path: Path) -> None:
     said: list[str] = []
     assert train(expert(tmp_path, 128), said.append).read_bytes() == first
     assert said[0] == "continuing at 128 of 128 steps"
+
+
+def test_two_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    with (
+        lock(tmp_path),
+        pytest.raises(RunFolderError, match="is in use by another process; wait for it or choose another folder"),
+    ):
+        train(expert(tmp_path, 128), lambda line: None)
 
 
 @pytest.mark.usefixtures("quick")

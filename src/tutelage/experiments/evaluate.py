@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tutelage.errors import ConfigError
+from tutelage.errors import ConfigError, RunFolderError
 from tutelage.experiments.assemble import assemble
 from tutelage.experiments.config import RunConfig
 from tutelage.experiments.run import loop_state, read_config
@@ -57,9 +58,10 @@ def evaluate_policy(
         try:
             assembly.learner.load_state_dict((learned or {})["learner"])
         except KeyError:
+            able = list(dict.fromkeys(name for name in (config.priority, "U.C.", "C.") if name != priority))
             raise ConfigError(
                 f"this run did not learn {', '.join(sorted(wanted))}, which {priority} looks at; evaluate it with "
-                f"{config.priority}, U.C. or C."
+                f"{', '.join(able[:-1])} or {able[-1]}"
             ) from None
     tally = tally or Tally(config.robots, config.humans)
     loop = assembly.loop(frozen=assembly.human if policy is None else policy)
@@ -85,6 +87,8 @@ def evaluate_run(
         RunFolderError, TutelageError: no run there, or no policy in it.
     """
     config = dataclasses.replace(read_config(folder), steps=steps)
+    if not os.access(folder, os.W_OK):  # before minutes of evaluation
+        raise RunFolderError(f"cannot write to {folder}, where the result goes; evaluate a copy of it")
     policy = None if expert else EnsemblePolicy.load(folder / "policy.safetensors")[0]
     remembers = priority == config.priority or LEARNED & parse(priority, gate=config.gate).needs
     learned = loop_state(folder) if remembers and not expert else None

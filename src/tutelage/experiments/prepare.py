@@ -101,7 +101,9 @@ def demonstrations(config: RunConfig, actor: Policy, horizon: int) -> Demonstrat
         good = np.flatnonzero(~failed)
         if len(good) < (1 if goal else episodes):
             what = "did not reach the goal" if goal else "fell"
-            raise ConfigError(f"the expert {what} in {int(failed.sum())} of {spare} demonstrations; choose a calmer level")
+            calm = level in (None, "none")
+            mend = "name a better one: --expert" if calm else "choose a calmer level: --offline-disturbance"
+            raise ConfigError(f"the expert {what} in {int(failed.sum())} of {spare} demonstrations; {mend}")
         good = good if goal else good[:episodes]
         for robot in good:
             end = ends[robot]

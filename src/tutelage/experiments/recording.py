@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,9 +25,13 @@ class EventStore:
     """`events.sqlite`: every allocation, intervention, fall, reset and success, in order.
 
     Table `events(t, robot, human, event, mode)`; `event` and `mode` are the numbers of `tutelage.fleet.modes`.
+
+    Attributes:
+        written: number of events that this run has written down.
     """
 
     def __init__(self, path: Path) -> None:
+        self.written = 0
         try:
             self._db = sqlite3.connect(path)
             self._db.execute("PRAGMA journal_mode=WAL")
@@ -44,36 +49,57 @@ class EventStore:
             rows = np.stack(events, axis=1).tolist()
             with _writing("events.sqlite"):
                 self._db.executemany("INSERT INTO events VALUES (?, ?, ?, ?, ?)", rows)
+            self.written += len(rows)
 
     def commit(self) -> None:
-        """Make everything so far durable."""
+        """Show everything so far to readers. A crash of the process loses none of it, a power cut may."""
         with _writing("events.sqlite"):
             self._db.commit()
 
+    def sync(self) -> None:
+        """Make everything so far durable: SQLite syncs its log when it moves it into the file."""
+        self.commit()
+        with _writing("events.sqlite"):
+            self._db.execute("PRAGMA wal_checkpoint(FULL)").fetchall()
+
+    def count(self, t: int) -> int:
+        """Number of events before timestep t."""
+        with _writing("events.sqlite"):
+            return int(self._db.execute("SELECT COUNT(*) FROM events WHERE t < ?", (t,)).fetchone()[0])
+
     def cut(self, t: int) -> None:
         """Forget timestep t and all later ones."""
-        self._db.execute("DELETE FROM events WHERE t >= ?", (t,))
-        self._db.commit()
+        with _writing("events.sqlite"):
+            self._db.execute("DELETE FROM events WHERE t >= ?", (t,))
+            self._db.commit()
+        self.written = self.count(t)
 
     def close(self) -> None:
         """Commit and close."""
         self.commit()
-        self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        self._db.close()
+        with _writing("events.sqlite"):
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            self._db.close()
 
 
 class MetricsFile:
-    """`metrics.jsonl`: one line of cumulative metrics every so many timesteps."""
+    """`metrics.jsonl`: one line of cumulative metrics every so many timesteps.
+
+    Attributes:
+        written: number of lines that this run has written down.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._file: TextIO = open(path, "a", encoding="utf-8")  # noqa: SIM115 - held for the length of the run
+        self.written = 0
+        self._file = self._open()
 
     def write(self, row: dict[str, float]) -> None:
         """Append a line."""
         with _writing(self._path.name):
             self._file.write(json.dumps(row) + "\n")
             self._file.flush()
+        self.written += 1
 
     def commit(self) -> None:
         """Make everything so far durable."""
@@ -81,9 +107,8 @@ class MetricsFile:
             self._file.flush()
             os.fsync(self._file.fileno())
 
-    def cut(self, t: int) -> None:
-        """Keep the lines of the first t timesteps; drop the rest, and a line that a crash left half written."""
-        self._file.close()
+    def lines(self, t: int) -> list[str]:
+        """The lines of the first t timesteps, up to one that cannot be read."""
         kept = []
         for line in self._path.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
@@ -92,8 +117,21 @@ class MetricsFile:
             except (json.JSONDecodeError, TypeError, KeyError):
                 break
             kept.append(line + "\n")
+        return kept
+
+    def cut(self, t: int) -> None:
+        """Keep the lines of the first t timesteps; drop the rest, and a line that a crash left half written."""
+        self._file.close()
+        kept = self.lines(t)
         write_atomic(self._path, "".join(kept).encode())  # a crash while resuming must not lose what was kept
-        self._file = open(self._path, "a", encoding="utf-8")  # noqa: SIM115
+        self._file = self._open()
+        self.written = len(kept)
+
+    def _open(self) -> TextIO:
+        try:
+            return open(self._path, "a", encoding="utf-8")  # held for the length of the run
+        except OSError as error:
+            raise RunFolderError(f"cannot open {self._path}: {error.strerror}; restore it or start a new run") from None
 
     def close(self) -> None:
         """Flush and close."""
@@ -119,7 +157,10 @@ class EpisodeFrames:
         except ImportError:
             raise MissingExtraError("pyarrow", "data") from None
         self._folder, self._which = folder, which
-        folder.mkdir(exist_ok=True)
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {folder}: {error.strerror}; restore it or start a new run") from None
         self._start = self._bytes = 0
         self._columns: dict[str, list[Any]] = {}
         self._file: Any = None
@@ -185,8 +226,9 @@ class EpisodeFrames:
     def cut(self, t: int) -> None:
         """Drop the files of timestep t and later ones."""
         for path in self._folder.glob("steps-*.parquet"):
-            if int(path.stem.split("-")[1]) >= t:
-                path.unlink()
+            if (named := re.fullmatch(r"steps-(\d+)-\d+", path.stem)) and int(named[1]) >= t:
+                with _writing(str(path)):
+                    path.unlink()
         self._start = t
 
     def state_dict(self) -> dict[str, Any]:
@@ -227,6 +269,8 @@ class Recorder:
         self.frames = EpisodeFrames(folder / "episodes", frames, robots) if frames != "none" else None
         self.steps, self.every = steps, every
         self.losses: dict[str, float] = {}
+        self._folder = folder
+        self._written: dict[str, int] = {}
 
     def on_start(self, loop: Loop) -> None:
         """Nothing to do."""
@@ -260,23 +304,35 @@ class Recorder:
 
     def commit(self, t: int) -> None:
         """Make the first t timesteps durable."""
-        self.events.commit()
+        self.events.sync()
         self.metrics.commit()
         if self.frames:
             self.frames.commit(t)
 
     def cut(self, t: int) -> None:
-        """Forget timestep t and all later ones."""
+        """Forget timestep t and all later ones.
+
+        Raises:
+            RunFolderError: what the restored state says was written down before is not there any more; nothing is cut.
+        """
+        found = {"events.sqlite": self.events.count(t), "metrics.jsonl": len(self.metrics.lines(t))}
+        for name, count in found.items():
+            if count != self._written.get(name, count):
+                raise RunFolderError(
+                    f"{self._folder / name} is damaged: {count:,} readable entries before timestep {t:,}, and "
+                    f"{self._written[name]:,} were written; restore it or start a new run"
+                )
         self.events.cut(t)
         self.metrics.cut(t)
         if self.frames:
             self.frames.cut(t)
 
     def state_dict(self) -> dict[str, Any]:
-        """Tally, last losses, episode numbers."""
+        """Tally, last losses, episode numbers, and how much is written down."""
         return {
             "tally": self.tally.state_dict(),
             "losses": dict(self.losses),
+            "written": {"events.sqlite": self.events.written, "metrics.jsonl": self.metrics.written},
             **({"frames": self.frames.state_dict()} if self.frames else {}),
         }
 
@@ -284,16 +340,19 @@ class Recorder:
         """Restore what `state_dict` returned."""
         self.tally.load_state_dict(state["tally"])
         self.losses = dict(state["losses"])
+        self._written = dict(state.get("written", {}))  # older checkpoints do not say
         if self.frames:
             self.frames.load_state_dict(state["frames"])
 
 
 @contextmanager
 def _writing(name: str) -> Iterator[None]:
-    """A full disk becomes one clear line."""
+    """A full disk becomes one clear line, and so does a damaged database."""
     try:
         yield
     except (OSError, sqlite3.Error) as error:
+        if type(error) is sqlite3.DatabaseError:  # what a disk or another process does is an OperationalError
+            raise RunFolderError(f"{name} is damaged: {error}; restore it or start a new run") from None
         reason = getattr(error, "strerror", None) or str(error)
         raise TutelageError(f"cannot write {name}: {reason}; free some space, then continue with: tutelage resume") from None
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -92,7 +93,9 @@ def load_run(path: Path | str) -> RunRecord:
         RunFolderError: it is not a run folder, or a file in it is missing, damaged or of another schema.
     """
     path = Path(path)
-    if not (path / "config.json").is_file():
+    if not os.path.isfile(path / "config.json"):  # unlike a Path's, it says no where nothing may be read
+        if path.is_dir() and not os.access(path, os.X_OK):
+            raise RunFolderError(f"cannot read {path}: Permission denied")
         reason = "it has no config.json" if path.is_dir() else "no such folder"
         raise RunFolderError(f"{path} is not a run folder: {reason}; give a folder that `tutelage run` wrote")
     config = _object(path / "config.json", _parse(path / "config.json", _text(path / "config.json")))
@@ -111,8 +114,15 @@ def load_run(path: Path | str) -> RunRecord:
     return RunRecord(path, config, metrics, log, evaluation)
 
 
-def run_folders(paths: Sequence[Path | str]) -> list[Path]:
+def run_folders(paths: Sequence[Path | str], say: Callable[[str], None] = lambda line: None) -> list[Path]:
     """The run folders that are meant: each path itself, or those in it. What a report left beside them is passed over.
+
+    Of several, so are folders that hold no run, such as that of an expert or of a run in preparation, and runs without a
+    line of metrics.
+
+    Args:
+        paths: as a user names them.
+        say: told what was passed over, if it is not a report's.
 
     Raises:
         RunFolderError: a path is no run folder, and holds none.
@@ -120,16 +130,31 @@ def run_folders(paths: Sequence[Path | str]) -> list[Path]:
     found: dict[Path, None] = {}
     for path in map(Path, paths):
         within = [one.parent for one in sorted(path.glob("*/config.json"))]
-        if (path / "config.json").is_file() or not within:
+        if os.path.isfile(path / "config.json") or not within:
             if len(paths) > 1 and (path.name == "report.html" or _holds_only(path, "curves.png")):
                 continue
             within = [path]
         found |= dict.fromkeys(within)
+    reasons = {path: reason for path in found if (reason := _nothing_in(path))}
+    if 0 < len(reasons) < len(found):
+        for path, reason in reasons.items():
+            del found[path]
+            say(f"passed over {path}: {reason}")
     return list(found)
 
 
+def _nothing_in(folder: Path) -> str:
+    """Why there is nothing to report of a folder yet; empty if there is, or something is wrong with it."""
+    if not folder.is_dir() or not os.access(folder, os.X_OK):
+        return ""
+    if not (folder / "config.json").exists():
+        return "it holds no run"
+    lines = folder / "metrics.jsonl"
+    return "it has not completed a step yet" if lines.is_file() and not lines.stat().st_size else ""
+
+
 def _holds_only(folder: Path, name: str) -> bool:
-    return folder.is_dir() and [entry.name for entry in folder.iterdir()] == [name]
+    return folder.is_dir() and os.access(folder, os.R_OK) and [entry.name for entry in folder.iterdir()] == [name]
 
 
 def load_runs(paths: Sequence[Path | str]) -> list[RunRecord]:

@@ -124,13 +124,14 @@ def summary_table(runs: Sequence[RunRecord]) -> str:
 # -- configurations ---------------------------------------------------------------------------------------------------------
 
 
-def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    """A nested configuration as dotted keys and JSON texts."""
+def flatten(config: dict[str, Any], prefix: str = "", digits: int = 17) -> dict[str, str]:
+    """A nested configuration as dotted keys and JSON texts, its floats with so many significant digits."""
     flat: dict[str, str] = {}
     for key, value in config.items():
         if isinstance(value, dict) and value:
-            flat |= flatten(value, f"{prefix}{key}.")
+            flat |= flatten(value, f"{prefix}{key}.", digits)
         else:
+            value = float(f"{value:.{digits}g}") if isinstance(value, float) else value
             flat[f"{prefix}{key}"] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return flat
 
@@ -140,15 +141,21 @@ SELF_EVIDENT = {"algorithm", "label", "out"}
 
 
 def differences(runs: Sequence[RunRecord]) -> dict[str, list[str]]:
-    """Settings that are not the same in all runs: dotted key -> the values of each algorithm, joined by commas."""
-    groups = [[flatten(run.config) for run in group] for group in by_label(runs).values()]
+    """Settings that are not the same in all runs: dotted key -> the values of each algorithm, joined by commas.
+
+    Numbers have 4 digits, unless they are the same then.
+    """
+    groups, short = ([[flatten(run.config, digits=d) for run in g] for g in by_label(runs).values()] for d in (17, 4))
     keys = {key: None for group in groups for flat in group for key in flat if key not in SELF_EVIDENT}
-    values = {
-        key: [list(dict.fromkeys(flat.get(key, ABSENT) for flat in group)) for group in groups]
-        for key in keys
-        if len({flat.get(key) for group in groups for flat in group}) > 1
+
+    def kinds(groups: list[list[dict[str, str]]], key: str) -> int:
+        return len({flat.get(key) for group in groups for flat in group})
+
+    shown = {key: short if kinds(short, key) > 1 else groups for key in keys if kinds(groups, key) > 1}
+    return {
+        key: [", ".join(dict.fromkeys(flat.get(key, ABSENT) for flat in group)) for group in chosen]
+        for key, chosen in shown.items()
     }
-    return {key: [", ".join(column) for column in columns] for key, columns in values.items()}
 
 
 # -- the page ---------------------------------------------------------------------------------------------------------------
@@ -289,7 +296,7 @@ def _results(runs: Sequence[RunRecord], groups: dict[str, list[RunRecord]]) -> s
 
 def _differences(changed: dict[str, list[str]], groups: dict[str, list[RunRecord]]) -> str:
     rows = [[f"<code>{escape(key)}</code>", *(escape(value) for value in values)] for key, values in changed.items()]
-    return _table(["", *(escape(label) for label in groups)], rows)
+    return _table(["", *(escape(label) for label in groups)], rows, "wraps")
 
 
 def _details(run: RunRecord, opened: bool) -> str:
@@ -365,6 +372,7 @@ figure img { display: block; width: 100%; height: auto; }
 figcaption, .caption { margin: .7rem 0 0; color: var(--muted); font-size: .87rem; }
 .scroll { overflow-x: auto; }
 .narrow { max-width: 600px; }
+.wraps td { white-space: normal; }
 table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .42rem .9rem; text-align: right; white-space: nowrap; border-top: 1px solid var(--line); }
 thead th { border-top: 0; font-weight: 600; vertical-align: bottom; }

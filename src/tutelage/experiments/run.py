@@ -112,6 +112,7 @@ class Run:
         _check_vacant(folder)  # another process may have made and left a run while this one assembled
         assembly = prepare(assembly, report)
         run = cls(folder, assembly, claim)
+        run.recorder.cut(0)  # what began here and was given up before its first metrics
         run.checkpoints.save(run.loop)
         write_atomic(folder / "environment.txt", environment().encode())
         # Written last: a folder with a configuration is one that can be continued.
@@ -151,6 +152,11 @@ class Run:
 def _check_vacant(folder: Path) -> None:
     if (folder / "config.json").exists():
         raise RunFolderError(f"{folder} already holds a run; continue it with: tutelage resume {folder}, or choose --out")
+    metrics = folder / "metrics.jsonl"
+    if metrics.is_file() and metrics.stat().st_size:
+        raise RunFolderError(
+            f"{folder} holds the recordings of a run without its config.json; restore that, or choose --out"
+        )
 
 
 def read_config(folder: Path) -> RunConfig:
@@ -163,8 +169,10 @@ def read_config(folder: Path) -> RunConfig:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         found = values.pop("format")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise RunFolderError(f"{folder} holds no run (no config.json); start one with: tutelage run") from None
+    except PermissionError as error:
+        raise RunFolderError(f"cannot read {path}: {error.strerror}") from None
     except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError):
         raise RunFolderError(f"{path} is damaged; restore it, or start a new run in another folder") from None
     if found != FORMAT:
