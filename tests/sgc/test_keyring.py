@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import stat
 import time
+import types
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -13,6 +14,7 @@ from members import POLICY, Fleet
 from tutelage.sgc import keyring as keyring_module
 from tutelage.sgc.epochs import CLOCK_TOLERANCE, Epoch, Epochs, read_epochs
 from tutelage.sgc.errors import NoKey, NotAllowed
+from tutelage.sgc.grants import Exchange
 from tutelage.sgc.home import Home
 from tutelage.sgc.keyring import Keyring
 from tutelage.sgc.reasons import Reason, Refused
@@ -72,6 +74,19 @@ def test_a_damaged_file_of_keys_is_asked_for_again(fleet: Fleet) -> None:
     again = Keyring(Home.open(fleet.homes["server"].path))
     assert again.epoch("camera") is None
     assert "camera" in again.wanted()
+
+
+def test_a_member_that_asks_with_an_impossible_key_is_refused_and_stops_no_change_of_keys(fleet: Fleet) -> None:
+    """A point of low order cannot be sealed to; nobody else may be left without the next key because of it."""
+    owner, member = fleet.keyrings["drone-1"], fleet.keyrings["server"]
+    give(fleet, "server")
+    for point in (bytes(32), b"\1" + bytes(31)):
+        public = types.SimpleNamespace(public_bytes_raw=lambda point=point: point)
+        evil = Exchange(member.home.access.entry("camera")).ask(member.home, bytes(16), public)
+        assert reason(owner.answer, "camera", evil) == Reason.MALFORMED
+    (push,) = owner.rotate("camera")
+    member.accept("camera", push.grant)
+    assert member.sealing("camera", time.time() + 3.0).key == owner.sealing("camera", time.time() + 3.0).key
 
 
 def test_nothing_in_a_request_or_grant_can_be_read_by_a_carrier(fleet: Fleet) -> None:
