@@ -180,6 +180,31 @@ def test_mistakes_with_a_fleet_at_hand_are_one_line(keys: Keys, fails: Keys) -> 
     assert "the policy of acme names no node for renewals" in fails("renew drone")
 
 
+def test_mixed_up_folders_files_and_options_change_nothing_and_are_named(keys: Keys, fails: Keys) -> None:
+    keys("init fleet --fleet acme")
+    keys("init drone --node drone-1")
+    keys("init server --node server")
+    assert "fleet holds the authority of a fleet already" in fails("init fleet --node drone-2")
+    assert "drone is the home of a node already" in fails("init drone --fleet other")
+    assert "cannot make the folder fleet/policy.toml: File exists; choose another" in fails(
+        "init fleet/policy.toml --node a"
+    )
+    assert "cannot read nofile" in fails("issue fleet drone nofile")
+    assert "fleet/policy.toml: not a signing request" in fails("issue fleet drone fleet/policy.toml")
+    assert "drone-1" not in keys("show fleet")  # one that cannot be read stops the others, too
+    keys("issue fleet drone server")
+    authority = Path("fleet/ca.key").read_bytes()
+    assert "fleet is the folder of an authority; --bundle and --authority" in fails("renew fleet --bundle fleet/outbox/deny")
+    assert "fleet is the folder of an authority; --bundle and --authority" in fails("renew fleet --authority fleet")
+    assert Path("fleet/ca.key").read_bytes() == authority
+    assert "drone is the folder of drone-1; --root-key, " in fails("renew drone --authority fleet --revoke-old")
+    assert "drone-1 does not take fleet/outbox/server.bundle: sealed to another node, or damaged; it needs" in fails(
+        "renew drone --bundle fleet/outbox/server.bundle"
+    )
+    assert "acme has no member 'nobody'" in fails("revoke fleet drone-1 nobody")
+    assert "revoked" not in keys("show fleet")
+
+
 def test_without_the_extra_the_verbs_name_it(tmp_path) -> None:
     code = "import sys; sys.modules['cryptography'] = None; from tutelage.cli import main; main(['keys', 'show', '.'])"
     said = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)

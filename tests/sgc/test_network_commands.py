@@ -80,6 +80,12 @@ def test_faults_are_one_line_that_names_the_remedy(fleet: Fleet, tmp_path: Path,
     assert "so where are the routers?" in fails(["ping", arm], capsys)
     assert "ping needs a count" in fails(["ping", arm, "--count", "0"], capsys)
     assert "top needs an interval" in fails(["top", arm, "--interval", "0"], capsys)
+    assert "ping needs a count" in fails(["ping", arm, "--timeout", "nan"], capsys)
+    assert "top needs an interval" in fails(["top", arm, "--interval", "nan"], capsys)
+    health = ["router", router, "--listen", f"tls/127.0.0.1:{free_port()}", "--health"]
+    assert "'127.0.0.1:²' is no address to serve health on" in fails([*health, "127.0.0.1:²"], capsys)
+    assert "'127.0.0.1:²' is no address" in fails(["proxy", "rosbridge", arm, "--listen", "127.0.0.1:²"], capsys)
+    assert "0 to 86400 seconds, not -1" in fails(["proxy", "topics", "--seconds", "-1"], capsys)
     NetworkConfig((Endpoint("tls", "127.0.0.1", free_port()),)).save(fleet["arm"].path)
     assert "arm reaches none of its routers" in fails(["ping", arm, "--timeout", "0.2"], capsys)
     assert "arm is not in subscribe of topic 'log'" in fails(["top", arm, "--topics", "log"], capsys)

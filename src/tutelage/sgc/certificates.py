@@ -119,7 +119,7 @@ def read_request(pem: bytes) -> Keys:
         genuine = asked.is_signature_valid
         keys = _keys(asked)
     except UNREADABLE as error:
-        raise Refused(Reason.MALFORMED, f"not a signing request: {error}") from None
+        raise Refused(Reason.MALFORMED, f"not a signing request: {str(error).partition('. See')[0]}") from None
     if not NODE_NAME.fullmatch(keys.common_name):
         raise Refused(Reason.MALFORMED, f"a signing request for the impossible name {keys.common_name!r}")
     if not genuine:

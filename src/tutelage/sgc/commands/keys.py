@@ -85,6 +85,8 @@ def issue(
     fleet = _authority(authority)
     if not requests and not policy:
         raise ConfigError("name signing requests (tutelage keys init --node NAME makes them), or --policy")
+    pems = [_request(each) for each in requests]  # all of them first: one that is damaged stops the others, too
+    names = [_name_of(pem) for pem in pems]
     if policy:
         bundles = fleet.publish(hours=hours)
         _say(f"policy {fleet.roster.serial} of {fleet.fleet} is signed; {len(bundles)} bundles in {authority / 'outbox'}")
@@ -93,10 +95,7 @@ def issue(
             _say(f"    tutelage keys renew HOME --bundle {authority / 'outbox'}/NAME.bundle")
     elif fleet.unsigned:
         _say(f"{authority / 'policy.toml'} has changed since it was signed, and holds for nobody yet; add --policy")
-    names = []
-    for request in requests:
-        pem = _read(request / "request.pem" if request.is_dir() else request)
-        names.append(_name_of(pem))
+    for pem in pems:
         fleet.issue(pem, hours=hours)
     for request, name in zip(requests, names, strict=True):  # only now: bundles of routers name all new nodes
         bundle = authority / "outbox" / f"{name}.bundle"
@@ -133,6 +132,8 @@ def renew(
     _need()
     if (home / "state.json").exists():
         fleet = _authority(home)
+        if bundle is not None or authority is not None:
+            raise ConfigError(f"{home} is the folder of an authority; --bundle and --authority are for a node's")
         fleet.renew_own(root_key, _passphrase(passphrase_file), revoke_old=revoke_old)
         _say(f"the authority of {fleet.fleet} has a new key, valid until {_when(fleet.certificate.not_valid_after_utc)}")
         if revoke_old:
@@ -141,13 +142,18 @@ def renew(
     from tutelage.sgc.reasons import Reason, Refused
 
     node = _home(home)
+    if root_key is not None or passphrase_file is not None or revoke_old:
+        raise ConfigError(
+            f"{home} is the folder of {node.name}; --root-key, --passphrase-file, --revoke-old: an authority's"
+        )
     if bundle is not None:
         try:
             what = node.accept(_read(bundle))
         except Refused as refused:
             if refused.reason == Reason.MALFORMED:
                 raise ConfigError(f"{bundle} is neither a bundle nor a deny list, or is damaged: {refused}") from None
-            raise
+            needs = f"it needs the newest outbox/{node.name}.bundle (or deny) of its own fleet's authority"
+            raise ConfigError(f"{node.name} does not take {bundle}: {refused}; {needs}") from None
         if what == "deny":
             _say(
                 f"{node.name} knows deny list {node.trust.deny_list.serial}: {len(node.trust.deny_list.pseudonyms)} revoked"
@@ -170,8 +176,7 @@ def revoke(authority: Positional[Path], nodes: Positional[tuple[str, ...]]) -> N
     fleet = _authority(authority)
     if not nodes:
         raise ConfigError("name at least one node")
-    for name in nodes:
-        fleet.revoke(name)
+    fleet.revoke(*nodes)
     _say(f"deny list {fleet.roster.deny_serial} of {fleet.fleet}: {', '.join(nodes)} revoked; routers have new bundles too")
     _say(f"it reaches running nodes by itself if tutelage keys serve runs; else carry {authority / 'outbox' / 'deny'}, and:")
     _say("    tutelage keys renew HOME --bundle deny")
@@ -185,7 +190,7 @@ def show(what: Positional[Path]) -> None:
     """
     _need()
     if what.is_file():
-        pem = _read(what)
+        pem = _request(what)
         _say(f"signing request of {_name_of(pem)}, fingerprint {_fingerprint(pem)}")
     elif (what / "state.json").exists():
         _show_authority(_authority(what))
@@ -322,6 +327,19 @@ def _home(folder: Path) -> Home:
 def _need() -> None:
     if _MISSING is not None:
         raise _MISSING
+
+
+def _request(path: Path) -> bytes:
+    """A signing request, or that of a node's folder; one that can be read."""
+    from tutelage.sgc.reasons import Refused
+
+    file = path / "request.pem" if path.is_dir() else path
+    pem = _read(file)
+    try:
+        _name_of(pem)
+    except Refused as refused:
+        raise ConfigError(f"{file}: {refused}; a node's is the request.pem of its folder") from None
+    return pem
 
 
 def _name_of(pem: bytes) -> str:

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from tutelage.sgc.proxies.routes import Routes
 
 
+MAX_SECONDS = 86400.0
+"""To listen to discovery."""
+
+
 class _Proxy(Protocol):
     def counters(self) -> dict[str, Any]: ...
 
@@ -129,6 +133,8 @@ def topics(domain: int = 0, seconds: float = 3.0) -> None:
 
     if not 0 <= domain <= MAX_DOMAIN:
         raise ConfigError(f"DDS domains go from 0 to {MAX_DOMAIN}, not {domain}")
+    if not 0 <= seconds <= MAX_SECONDS:
+        raise ConfigError(f"one can listen for 0 to {MAX_SECONDS:g} seconds, not {seconds:g}")
     with Domain(domain) as joined:
         found = discover(joined, seconds)
     if not found:
