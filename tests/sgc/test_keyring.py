@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import stat
 import time
 import types
@@ -13,7 +14,7 @@ from members import POLICY, Fleet
 
 from tutelage.sgc import keyring as keyring_module
 from tutelage.sgc.epochs import CLOCK_TOLERANCE, Epoch, Epochs, read_epochs
-from tutelage.sgc.errors import NoKey, NotAllowed
+from tutelage.sgc.errors import KeysError, NoKey, NotAllowed
 from tutelage.sgc.grants import Exchange
 from tutelage.sgc.home import Home
 from tutelage.sgc.keyring import Keyring
@@ -74,6 +75,21 @@ def test_a_damaged_file_of_keys_is_asked_for_again(fleet: Fleet) -> None:
     again = Keyring(Home.open(fleet.homes["server"].path))
     assert again.epoch("camera") is None
     assert "camera" in again.wanted()
+
+
+def test_a_folder_of_keys_that_was_removed_is_made_again(fleet: Fleet) -> None:
+    """The owner must be able to change its keys; who it is does not depend on that folder."""
+    give(fleet, "server")
+    for name in ("drone-1", "server"):
+        shutil.rmtree(fleet.homes[name].path / "keys")
+    (push,) = fleet.keyrings["drone-1"].rotate("camera")
+    fleet.keyrings["server"].accept("camera", push.grant)
+    folder = fleet.homes["server"].path / "keys"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    shutil.rmtree(folder)
+    folder.write_text("")
+    with pytest.raises(KeysError, match=r"cannot make the folder \S+keys: File exists; move away what is there"):
+        give(fleet, "server")
 
 
 def test_a_member_that_asks_with_an_impossible_key_is_refused_and_stops_no_change_of_keys(fleet: Fleet) -> None:

@@ -7,7 +7,6 @@ this one again within a second, and what they missed is replayed.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import socket
 import threading
@@ -209,8 +208,10 @@ class Router:
         """Start again when the folder calls for other rules, or holds a new certificate."""
         expires = self.home.expires
         while not self._closed.wait(FOLLOW):
-            with contextlib.suppress(TutelageError):
+            try:
                 self.home.refresh()
+            except TutelageError as error:
+                log.warning("%s", error)
             try:
                 if self.running and self.home.expires == expires and self.rules() == self._rules:
                     continue
