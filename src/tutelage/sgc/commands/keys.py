@@ -38,13 +38,13 @@ def init(
 
     Args:
         folder: where.
-        fleet: name of a new fleet: makes its root, its authority and a policy to fill in.
+        fleet: name of a new fleet: makes its root, its authority and a policy to fill in. This, node or router is needed.
         node: name of a node: makes its keys and a signing request.
         router: name of a router, likewise.
-        address: IP addresses and host names at which others reach the router.
-        connect: routers that the node dials, such as tls/192.0.2.7:7447, for its network.toml.
-        root: root.pem of the fleet; the node then believes no other, not even at first.
-        passphrase_file: its content encrypts the root's key.
+        address: IP addresses and host names at which others reach the router, which needs one at least; a node has none.
+        connect: routers that the node dials, such as tls/192.0.2.7:7447, for its network.toml; without it, write that file.
+        root: root.pem of the fleet; the node then believes no other. Without it, it believes the root of its first bundle.
+        passphrase_file: its content encrypts the root's key; without it, the key lies there in clear.
     """
     _need()
     from tutelage.sgc.rules import Role
@@ -79,6 +79,7 @@ def issue(
     Args:
         authority: folder of the fleet's authority.
         requests: signing requests of nodes and routers; of a node's folder on this machine, the answer is put there at once.
+            None: only the policy is signed, with --policy.
         policy: sign policy.toml as it now is: a new bundle for every member.
         hours: validity of the certificates.
     """
@@ -122,11 +123,11 @@ def renew(
 
     Args:
         home: the node's folder; of an authority: a new key and certificate for itself, signed by the root.
-        bundle: what the authority gave: a bundle or a deny list.
-        authority: folder of the fleet's authority on this machine.
+        bundle: what the authority gave: a bundle or a deny list; without it and --authority, it is asked for on the network.
+        authority: folder of the fleet's authority on this machine, which signs at once.
         hours: validity, with --authority.
-        root_key: for an authority: where the root's key is, if not in its folder.
-        passphrase_file: for an authority: the passphrase of the root's key.
+        root_key: for an authority: where the root's key is; without it, root/root.key in its folder.
+        passphrase_file: for an authority: the passphrase of the root's key; without it, the key is in clear.
         revoke_old: for an authority whose key was stolen: refuse all that it signed; all nodes need their new bundles.
     """
     _need()
