@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import errno
 import shutil
 import stat
 import threading
 import time
 import types
+from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -352,3 +354,22 @@ def test_an_authority_is_not_overwritten(fleet: Fleet) -> None:
         Authority.create(fleet.authority.path, "acme")
     with pytest.raises(KeysError, match="a fleet's name is 1 to 63 letters"):
         Authority.create(fleet.path / "x", "a/b")
+
+
+def test_a_folder_that_nobody_may_look_into_is_named_and_not_made_anew(fleet: Fleet, monkeypatch) -> None:
+    def refused(path, **named):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", refused)
+    for create in (Home.create, Authority.create):
+        with pytest.raises(KeysError, match="cannot look into .*server: Permission denied; is it yours"):
+            create(fleet.homes["server"].path, "x")
+
+
+def test_a_policy_that_cannot_be_read_is_named(fleet: Fleet, monkeypatch) -> None:
+    def refused(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    with pytest.raises(KeysError, match=r"cannot read .*/policy.toml: Permission denied$"):
+        assert fleet.authority.unsigned

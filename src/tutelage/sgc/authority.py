@@ -37,7 +37,7 @@ from tutelage.sgc.envelope import derive
 from tutelage.sgc.errors import KeysError
 from tutelage.sgc.names import SECRET_BYTES, Name
 from tutelage.sgc.policy import TEMPLATE, Policy, routes
-from tutelage.sgc.privatekeys import key_pem, load_signing_key, make_folder, save_key
+from tutelage.sgc.privatekeys import holds, key_pem, load_signing_key, make_folder, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.roster import Roster
 from tutelage.sgc.rules import NODE_NAME, Role
@@ -77,6 +77,10 @@ class Authority:
             ) from None
         except (OSError, ValueError, TypeError) as error:
             raise KeysError(f"{path} is damaged: {error}; restore it from a copy") from None
+        try:
+            self._certificate.verify_directly_issued_by(self._root)
+        except certificates.UNREADABLE:
+            raise KeysError(f"{path} is damaged: ca.pem does not come from root.pem; restore it from a copy") from None
 
     @classmethod
     def create(cls, path: Path, fleet: str, *, passphrase: bytes | None = None) -> Authority:
@@ -89,9 +93,9 @@ class Authority:
         """
         if not NODE_NAME.fullmatch(fleet):
             raise KeysError(f"a fleet's name is 1 to 63 letters, digits, '.', '_' and '-', not {fleet!r}")
-        if (path / "state.json").exists():
+        if holds(path, "state.json"):
             raise KeysError(f"{path} holds the authority of a fleet already; choose another folder")
-        if (path / "node.json").exists():
+        if holds(path, "node.json"):
             raise KeysError(f"{path} is the home of a node already; choose another folder")
         make_folder(path)
         root_key = Ed25519PrivateKey.generate()
@@ -147,7 +151,16 @@ class Authority:
     def unsigned(self) -> bool:
         """Has the policy file changed since `publish`?"""
         file, signed = self.path / "policy.toml", self.path / "published.toml"
-        return file.is_file() and file.read_bytes() != signed.read_bytes()
+        try:
+            return file.is_file() and not (signed.is_file() and file.read_bytes() == signed.read_bytes())
+        except OSError as error:
+            raise KeysError(f"cannot read {error.filename}: {error.strerror}") from None
+
+    def strangers(self) -> list[str]:
+        """Names in the policy that was published that are no members: yet to come, or misspelt."""
+        policy = self._policy()
+        names = {name for rule in policy.topics.values() for name in rule.names()} | {policy.renewals} - {""}
+        return sorted(names - self._roster.members.keys())
 
     def refresh(self) -> None:
         """Read again what another process changed."""
@@ -232,8 +245,12 @@ class Authority:
             ConfigError: the policy file has a fault; nothing is changed.
         """
         _check_hours(hours)
-        Policy.load(self.path / "policy.toml")
+        policy = Policy.load(self.path / "policy.toml")
         with self._changing():
+            named = {f"owner of {alias!r}": rule.owner for alias, rule in policy.topics.items()}
+            for what, name in {"renewals": policy.renewals, **named}.items():
+                if name in self.routers:
+                    raise KeysError(f"{self.path / 'policy.toml'}: {what} is {name}, a router; only nodes have a part in it")
             self._files[self.path / "published.toml"] = (self.path / "policy.toml").read_bytes()
             self._roster.serial += 1
             return {name: self._bundle(name, hours) for name in list(self._roster.members)}
@@ -294,6 +311,8 @@ class Authority:
     def _policy(self) -> Policy:
         path = self.path / "published.toml"
         content = self._files.get(path)
+        if content is None and not path.is_file():
+            raise KeysError(f"{self.fleet} has no signed policy (no {path}): tutelage keys issue {self.path} --policy")
         return Policy.load(path) if content is None else Policy.parse(content.decode())
 
     def _topic_secret(self, canonical: bytes) -> bytes:

@@ -29,7 +29,7 @@ from tutelage.sgc import certificates
 from tutelage.sgc.access import Access
 from tutelage.sgc.bundle import Bundle, is_bundle
 from tutelage.sgc.errors import KeysError, NotIssued
-from tutelage.sgc.privatekeys import load_sealing_key, load_signing_key, make_folder, save_key
+from tutelage.sgc.privatekeys import holds, load_sealing_key, load_signing_key, make_folder, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import NODE_NAME, Role
 from tutelage.sgc.trust import Member, Trust
@@ -90,9 +90,9 @@ class Home:
         """
         if not NODE_NAME.fullmatch(name):
             raise KeysError(f"a node's name is 1 to 63 letters, digits, '.', '_' and '-', not {name!r}")
-        if (path / "node.json").exists():
+        if holds(path, "node.json"):
             raise KeysError(f"{path} is the home of a node already; choose another folder")
-        if (path / "state.json").exists():
+        if holds(path, "state.json"):
             raise KeysError(f"{path} holds the authority of a fleet already; choose another folder")
         if role == Role.ROUTER:
             certificates.check_addresses(addresses)

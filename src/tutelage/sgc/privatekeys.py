@@ -14,6 +14,18 @@ from tutelage.files import write_atomic
 from tutelage.sgc.errors import KeysError
 
 
+def holds(folder: Path, name: str) -> bool:
+    """Is there a file of this name?
+
+    Raises:
+        KeysError: nobody may look.
+    """
+    try:
+        return (folder / name).exists()
+    except OSError as error:
+        raise KeysError(f"cannot look into {folder}: {error.strerror}; is it yours?") from None
+
+
 def make_folder(path: Path) -> None:
     """A folder for keys, which only its owner may enter.
 

@@ -106,6 +106,11 @@ class TopicRule:
         """May this node hold the topic's key: owner, or sender or receiver on any lane?"""
         return node == self.owner or any(_any(node, getattr(self, who)) for who in _WHO)
 
+    def names(self) -> set[str]:
+        """All nodes that the rule names, patterns left out."""
+        named = {self.owner, *(name for who in _WHO for name in getattr(self, who))}
+        return {name for name in named if NODE_NAME.fullmatch(name)}
+
     def lanes(self) -> tuple[Lane, ...]:
         """STREAM for a stream, REQUEST and REPLY for a service; PRESENCE for both."""
         return (*((Lane.STREAM,) if self.kind == Kind.STREAM else (Lane.REQUEST, Lane.REPLY)), Lane.PRESENCE)

@@ -83,6 +83,8 @@ def issue(
         policy: sign policy.toml as it now is: a new bundle for every member.
         hours: validity of the certificates.
     """
+    from tutelage.sgc.reasons import Refused
+
     fleet = _authority(authority)
     if not requests and not policy:
         raise ConfigError("name signing requests (tutelage keys init --node NAME makes them), or --policy")
@@ -101,11 +103,16 @@ def issue(
     for request, name in zip(requests, names, strict=True):  # only now: bundles of routers name all new nodes
         bundle = authority / "outbox" / f"{name}.bundle"
         if request.is_dir():
-            _home(request).accept(bundle.read_bytes())
+            try:
+                _home(request).accept(bundle.read_bytes())
+            except Refused as refused:
+                raise ConfigError(f"{request} does not take {bundle}, the certificate of {name}: {refused}") from None
             _say(f"{name}: certificate for {hours:g} hours, installed in {request}")
         else:
             _say(f"{name}: certificate for {hours:g} hours in {bundle}; on the node:")
             _say(f"    tutelage keys renew HOME --bundle {name}.bundle")
+    if policy and (strangers := fleet.strangers()):
+        _say(f"the policy names {', '.join(strangers)}, no members of {fleet.fleet} yet")
     for name in sorted(set(fleet.routers) - set(names)) if requests else ():
         _say(f"{name}: the router must hear of them: tutelage keys renew HOME --bundle {authority / 'outbox' / name}.bundle")
 
@@ -131,7 +138,9 @@ def renew(
         revoke_old: for an authority whose key was stolen: refuse all that it signed; all nodes need their new bundles.
     """
     _need()
-    if (home / "state.json").exists():
+    from tutelage.sgc.privatekeys import holds
+
+    if holds(home, "state.json"):
         fleet = _authority(home)
         if bundle is not None or authority is not None:
             raise ConfigError(f"{home} is the folder of an authority; --bundle and --authority are for a node's")
@@ -190,10 +199,12 @@ def show(what: Positional[Path]) -> None:
         what: a node's folder, an authority's, or a signing request.
     """
     _need()
+    from tutelage.sgc.privatekeys import holds
+
     if what.is_file():
         pem = _request(what)
         _say(f"signing request of {_name_of(pem)}, fingerprint {_fingerprint(pem)}")
-    elif (what / "state.json").exists():
+    elif holds(what, "state.json"):
         _show_authority(_authority(what))
     else:
         _show_home(_home(what))
@@ -248,6 +259,11 @@ def _renew_by_network(home: Home) -> None:
     from tutelage.sgc.transport.config import Identity, NetworkConfig
     from tutelage.sgc.transport.zenoh import ZenohTransport
 
+    if home.expires < time.time():
+        raise ConfigError(
+            f"the certificate of {home.name} has expired, so nobody on the network believes it: use --bundle, with what "
+            f"tutelage keys issue gives, or --authority"
+        )
     home.check()
     if home.access.renewals is None:
         raise ConfigError(
