@@ -7,7 +7,9 @@ another five minutes; else 503. The body says why, in JSON.
 from __future__ import annotations
 
 import json
+import logging
 import re
+import sys
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,6 +18,17 @@ from typing import Any, Self
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.health import Tree, prometheus
+
+log = logging.getLogger(__name__)
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that hangs up, or says nothing, is none of our faults; anything else is logged."""
+        if not isinstance(sys.exception(), OSError):
+            log.exception("health, as asked by %s", client_address)
 
 
 class HealthServer:
@@ -58,11 +71,10 @@ class HealthServer:
                 return
 
         try:
-            self._server = ThreadingHTTPServer((host.strip("[]"), int(port)), Handler)
+            self._server = _Server((host.strip("[]"), int(port)), Handler)
         except (OSError, UnicodeError) as error:  # a name with a label that is too long is no text for the resolver
             why = error.strerror if isinstance(error, OSError) else error
             raise ConfigError(f"cannot serve health on {address}: {why}") from None
-        self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="sgc-health", daemon=True)
         self._thread.start()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import re
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,25 @@ class Tls:
             return self.certificate.read_bytes(), self.key.read_bytes(), clients
         except OSError as error:
             raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
+
+    def context(self) -> ssl.SSLContext:
+        """For a server of the standard library.
+
+        Raises:
+            ConfigError: a file cannot be read, or they do not belong together.
+        """
+        self.read()  # for its error
+        try:
+            context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=self.clients)
+        except ssl.SSLError as error:
+            raise ConfigError(f"cannot use {self.clients} as an authority: {error.reason or error}") from None
+        try:
+            context.load_cert_chain(self.certificate, self.key, password="")  # one with a passphrase must not ask for it
+        except ssl.SSLError as error:
+            raise ConfigError(f"cannot use {self.certificate} with {self.key}: {error.reason or error}") from None
+        if self.clients is not None:
+            context.verify_mode = ssl.CERT_REQUIRED
+        return context
 
 
 def parse_address(address: str) -> tuple[str, int]:
