@@ -220,7 +220,7 @@ class Sealer:
         self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Buffer, now: int
     ) -> bytes:
         if self._mode == SESSION:
-            return tags(self._sessions, header, sealed)
+            return tags(self._sessions, header, sealed, bind)
         statement = self._statements.message(header, bind, body)
         key = self._home.signing_key
         # A signature is sealed too: in clear, anyone who knows a node's certificate could tell which packets are its own.
