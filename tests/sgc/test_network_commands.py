@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 import threading
 from pathlib import Path
 
 import pytest
-from sgc.fleets import Fleet, Programs, free_port, topic
+from sgc.fleets import Fleet, Programs, eventually, free_port, topic
 
 from tutelage.cli import main
+from tutelage.errors import ConfigError
 from tutelage.sgc.commands.stopping import Stop, until_stopped
+from tutelage.sgc.router import Router, RouterConfig
+from tutelage.sgc.rules import Role
 from tutelage.sgc.transport.config import Endpoint, NetworkConfig
 
 pytest.importorskip("zenoh", reason="needs the extra sgc")
@@ -89,6 +93,34 @@ def test_faults_are_one_line_that_names_the_remedy(fleet: Fleet, tmp_path: Path,
     NetworkConfig((Endpoint("tls", "127.0.0.1", free_port()),)).save(fleet["arm"].path)
     assert "arm reaches none of its routers" in fails(["ping", arm, "--timeout", "0.2"], capsys)
     assert "arm is not in subscribe of topic 'log'" in fails(["top", arm, "--topics", "log"], capsys)
+
+
+def test_a_router_that_cannot_listen_everywhere_lets_go_of_what_it_has(fleet: Fleet) -> None:
+    where = f"tls/127.0.0.1:{free_port()}"
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        router = Router(fleet["router"], RouterConfig.of([where, f"wss/127.0.0.1:{taken.getsockname()[1]}"]))
+        with pytest.raises(ConfigError, match="cannot listen on wss"):
+            router.start()
+        assert not router.running
+    with Router(fleet["router"], RouterConfig.of([where])) as again:
+        assert again.running
+
+
+def test_a_router_whose_port_was_taken_when_it_started_again_comes_back(fleet: Fleet, monkeypatch) -> None:
+    def taken() -> None:
+        raise ConfigError("cannot listen")
+
+    with Router(fleet["router"], RouterConfig.of([f"tls/127.0.0.1:{free_port()}"])) as router:
+        monkeypatch.setattr(router, "_insist", lambda begin: begin())
+        begin = router._begin
+        monkeypatch.setattr(router, "_begin", taken)
+        fleet.join("late", Role.NODE)
+        fleet["router"].accept((fleet.authority.path / "outbox" / "router.bundle").read_bytes())
+        eventually(lambda: not router.running)
+        monkeypatch.setattr(router, "_begin", begin)
+        eventually(lambda: router.running)
 
 
 def test_a_signal_that_another_thread_takes_stops_a_program_as_well() -> None:
