@@ -95,6 +95,18 @@ def test_faults_are_one_line_that_names_the_remedy(fleet: Fleet, tmp_path: Path,
     assert "arm is not in subscribe of topic 'log'" in fails(["top", arm, "--topics", "log"], capsys)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_whoever_serves_renewals_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
+    fleet = Fleet(tmp_path, 'version = 1\nrenewals = "server"\n' + topic("log", ["arm"], ["server"]), ["arm", "server"])
+    NetworkConfig((Endpoint("tls", "127.0.0.1", free_port()),)).save(fleet["server"].path)
+    command = [*TUTELAGE, "keys", "serve", str(fleet.authority.path), str(fleet["server"].path)]
+    office = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert office.stdout
+    assert office.stdout.readline() == "server renews certificates of acme; Ctrl-C ends it\n"
+    office.send_signal(number)
+    assert office.wait(10) == 0
+
+
 def test_a_router_that_cannot_listen_everywhere_lets_go_of_what_it_has(fleet: Fleet) -> None:
     where = f"tls/127.0.0.1:{free_port()}"
     with socket.socket() as taken:

@@ -220,6 +220,7 @@ def serve(authority: Positional[Path], home: Positional[Path], hours: float = 24
     """
     fleet, node_home = _authority(authority), _home(home)
     from tutelage.sgc import lanes
+    from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.node import Node
     from tutelage.sgc.office import Office
 
@@ -230,11 +231,10 @@ def serve(authority: Positional[Path], home: Positional[Path], hours: float = 24
             f"then: tutelage keys issue {authority} --policy"
         )
     office = Office(fleet, node_home, hours=hours)
-    with Node.open(node_home) as node:
+    with until_stopped() as stop, Node.open(node_home) as node:
         node.transport.serve(lanes.key(node.access.control, lanes.RENEW), office.answer)
         _say(f"{node.name} renews certificates of {fleet.fleet}; Ctrl-C ends it")
-        while True:
-            time.sleep(1.0)
+        stop.wait()
 
 
 VERBS = {"init": init, "issue": issue, "renew": renew, "revoke": revoke, "show": show, "serve": serve}
