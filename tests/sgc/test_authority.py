@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import base64
+import errno
 import shutil
 import stat
 import threading
 import time
+import types
+from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from members import POLICY, Fleet
 
 from tutelage.errors import ConfigError
+from tutelage.files import write_atomic
+from tutelage.sgc import authority as authority_module
+from tutelage.sgc import certificates
 from tutelage.sgc.authority import Authority
+from tutelage.sgc.bundle import Bundle
 from tutelage.sgc.errors import KeysError, NotIssued
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Reason, Refused
@@ -170,6 +178,110 @@ def test_routers_hear_of_new_and_revoked_members(fleet: Fleet) -> None:
     assert drone.pseudonym in router.trust.deny_list.pseudonyms
 
 
+def files(fleet: Fleet) -> dict[str, bytes]:
+    """All that the authority keeps."""
+    return {str(file): file.read_bytes() for file in fleet.authority.path.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("what", ["publish", "issue", "revoke", "renew_own"])
+def test_what_is_interrupted_has_changed_nothing(fleet: Fleet, what: str, monkeypatch) -> None:
+    """Ctrl-C between two bundles: no certificate may exist that the list of members does not know, no policy be half signed."""
+    fleet.join("router-1", Role.ROUTER)
+    request = Home.create(fleet.path / "drone-7", "drone-7").request()
+    (fleet.authority.path / "policy.toml").write_text(POLICY + "\n# changed\n")
+    before, seal = files(fleet), Bundle.seal
+    left = ["one bundle"] * (what in ("publish", "renew_own"))
+
+    def interrupted(bundle, to, key):
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        return seal(bundle, to, key)
+
+    monkeypatch.setattr(Bundle, "seal", interrupted)
+    calls = {
+        "publish": fleet.authority.publish,
+        "issue": lambda: fleet.authority.issue(request),
+        "revoke": lambda: fleet.authority.revoke("server"),
+        "renew_own": lambda: fleet.authority.renew_own(revoke_old=True),
+    }
+    with pytest.raises(KeyboardInterrupt):
+        calls[what]()
+    assert files(fleet) == before
+    assert fleet.authority.unsigned
+    monkeypatch.undo()
+    calls[what]()
+    server = fleet.homes["server"]
+    if what == "issue":
+        drone = Home.open(fleet.path / "drone-7")
+        drone.accept((fleet.authority.path / "outbox" / "drone-7.bundle").read_bytes())
+        assert server.trust.verify(drone.credential).pseudonym == fleet.authority.roster.members["drone-7"].pseudonym
+    elif what != "revoke":
+        server.accept((fleet.authority.path / "outbox" / "server.bundle").read_bytes())
+
+
+def test_an_interrupted_renewal_of_the_authority_is_done_again(fleet: Fleet, monkeypatch) -> None:
+    def full(path, content, *, private=False):
+        if path.name == "ca.pem":
+            raise KeyboardInterrupt
+        write_atomic(path, content, private=private)
+
+    monkeypatch.setattr(authority_module, "write_atomic", full)
+    with pytest.raises(KeyboardInterrupt):
+        fleet.authority.renew_own(revoke_old=True)
+    monkeypatch.undo()
+    authority, drone = Authority.open(fleet.authority.path), fleet.homes["drone-1"]
+    with pytest.raises(KeysError, match=r"was interrupted; do it again: tutelage keys renew \S+$"):
+        authority.renew(drone.request())
+    authority.renew_own(revoke_old=True)
+    drone.accept((fleet.authority.path / "outbox" / "drone-1.bundle").read_bytes())
+    assert stat.S_IMODE((fleet.authority.path / "ca.key").stat().st_mode) == 0o600
+
+
+def test_whoever_serves_renewals_follows_a_new_key_of_the_authority(fleet: Fleet) -> None:
+    serving, drone = Authority.open(fleet.authority.path), fleet.homes["drone-1"]
+    fleet.authority.renew_own(revoke_old=True)
+    serving.refresh()
+    drone.accept(serving.renew(drone.request()))
+    drone.check()
+
+
+def test_all_are_revoked_or_nobody(fleet: Fleet) -> None:
+    with pytest.raises(KeysError, match="no member 'nobody'; members: drone-1, server"):
+        fleet.authority.revoke("server", "nobody")
+    assert fleet.authority.roster.deny_serial == 0
+    fleet.authority.revoke("server", "server")
+    with pytest.raises(KeysError, match="has revoked 'server' already; members: drone-1"):
+        fleet.authority.revoke("server")
+
+
+def test_hours_that_cannot_be_sign_no_policy(tmp_path) -> None:
+    authority = Authority.create(tmp_path / "a", "acme")
+    (tmp_path / "a" / "policy.toml").write_text(POLICY)
+    with pytest.raises(KeysError, match="not nan"):
+        authority.publish(hours=float("nan"))
+    assert authority.unsigned
+
+
+def test_a_request_with_an_impossible_key_is_refused(fleet: Fleet, tmp_path) -> None:
+    signing = Ed25519PrivateKey.generate()
+    sealing = types.SimpleNamespace(public_bytes_raw=lambda: bytes(32))
+    request = certificates.request(certificates.Keys("drone-9", Role.NODE, signing.public_key(), sealing), signing)
+    with pytest.raises(Refused, match="not a signing request"):
+        fleet.authority.issue(request)
+
+
+def test_folders_of_nodes_and_of_authorities_are_not_mixed(fleet: Fleet, tmp_path) -> None:
+    with pytest.raises(KeysError, match="holds the authority of a fleet already; choose another folder"):
+        Home.create(fleet.authority.path, "drone-8")
+    with pytest.raises(KeysError, match="is the home of a node already; choose another folder"):
+        Authority.create(fleet.homes["server"].path, "other")
+    (tmp_path / "file").write_text("")
+    for create in (Home.create, Authority.create):
+        with pytest.raises(KeysError, match=r"cannot make the folder \S+file/a: Not a directory; choose another"):
+            create(tmp_path / "file" / "a", "x")
+
+
 def test_the_outbox_holds_what_must_be_carried(fleet: Fleet) -> None:
     fleet.authority.publish()
     fleet.authority.revoke("server")
@@ -242,3 +354,22 @@ def test_an_authority_is_not_overwritten(fleet: Fleet) -> None:
         Authority.create(fleet.authority.path, "acme")
     with pytest.raises(KeysError, match="a fleet's name is 1 to 63 letters"):
         Authority.create(fleet.path / "x", "a/b")
+
+
+def test_a_folder_that_nobody_may_look_into_is_named_and_not_made_anew(fleet: Fleet, monkeypatch) -> None:
+    def refused(path, **named):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", refused)
+    for create in (Home.create, Authority.create):
+        with pytest.raises(KeysError, match="cannot look into .*server: Permission denied; is it yours"):
+            create(fleet.homes["server"].path, "x")
+
+
+def test_a_policy_that_cannot_be_read_is_named(fleet: Fleet, monkeypatch) -> None:
+    def refused(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    with pytest.raises(KeysError, match=r"cannot read .*/policy.toml: Permission denied$"):
+        assert fleet.authority.unsigned

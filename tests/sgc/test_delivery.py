@@ -206,3 +206,14 @@ def test_any_bytes_are_a_frame_or_refused(data: bytes) -> None:
         frames.parse(data)
     except Refused as refused:
         assert refused.reason == Reason.MALFORMED
+
+
+@pytest.mark.parametrize("kind", [InOrder, Newest])
+def test_two_programs_of_one_sender_are_noticed_and_a_restart_is_not(kind) -> None:
+    order, second = kind(0.0), 1_000_000_000
+    order.accept(message(1)._replace(sent=second), 0.0)
+    order.accept(message(1, OTHER)._replace(sent=10 * second), 1.0)
+    order.accept(message(2)._replace(sent=9 * second), 1.0)  # of the earlier start, overtaken
+    assert order.twice == set()
+    order.accept(message(3)._replace(sent=16 * second), 7.0)
+    assert order.twice == {"arm"}

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import http.client
 import json
+import socket
+import struct
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -58,6 +61,22 @@ def test_health_and_metrics_of_a_node(tmp_path: Path) -> None:
             code, text = get(f"{url}/healthz")
             assert (code, json.loads(text)["problems"]) == (503, ["not connected to a router"])
         assert get(f"{url}/else")[0] == 404
+
+
+def test_whoever_hangs_up_leaves_no_traceback_and_a_fault_of_ours_is_logged(capfd, caplog) -> None:
+    def broken() -> dict[str, object]:
+        raise KeyError("oh")
+
+    with HealthServer("127.0.0.1:0", broken, lambda: {"x": {str(k): k for k in range(200_000)}}) as pages:
+        for asked in (b"GET /metrics HTTP/1.0\r\n\r\n", b"GET"):
+            client = socket.create_connection(("127.0.0.1", pages.port))
+            client.sendall(asked)
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, not a farewell
+            client.close()
+        with pytest.raises((OSError, http.client.HTTPException)):
+            get(f"http://127.0.0.1:{pages.port}/healthz")
+        eventually(lambda: "health, as asked by" in caplog.text)
+    assert capfd.readouterr().err == ""
 
 
 def test_counts_of_two_subscriptions_of_a_topic_add_up(tmp_path: Path) -> None:

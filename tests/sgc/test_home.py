@@ -14,9 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from members import POLICY, Fleet
 
+from tutelage.files import write_atomic
+from tutelage.sgc import home as home_module
 from tutelage.sgc import trust as trust_module
 from tutelage.sgc.bundle import CONTEXT
-from tutelage.sgc.certificates import pem
+from tutelage.sgc.certificates import pem, read_request
 from tutelage.sgc.envelope import open_sealed, seal_to
 from tutelage.sgc.errors import KeysError, NotIssued
 from tutelage.sgc.home import Home
@@ -182,13 +184,35 @@ def test_a_file_that_was_damaged_is_named_and_the_running_node_goes_on(fleet: Fl
     bundle = home.path / "bundle"
     content = bundle.read_bytes()
     bundle.write_bytes(content[:-1])
-    with pytest.raises(KeysError, match=f"{home.path} holds a file that cannot be believed"):
+    with pytest.raises(KeysError, match="holds a file of drone-1 that cannot be believed: .*; remove its files bundle and"):
         home.refresh()
     home.check()
     with pytest.raises(KeysError, match="cannot be believed"):
         Home.open(home.path)
+    bundle.unlink()
+    bundle.mkdir()
+    with pytest.raises(KeysError, match="cannot read .*/bundle: Is a directory; remove"):
+        Home.open(home.path)
+    bundle.rmdir()
     bundle.write_bytes(content)
     assert home.refresh()
+
+
+def test_a_home_that_was_interrupted_is_made_anew(tmp_path, monkeypatch) -> None:
+    """Ctrl-C before the last file: it is no home yet, and nothing is in the way of the next attempt."""
+
+    def interrupted(path, content, *, private=False):
+        if path.name == "node.json":
+            raise KeyboardInterrupt
+        write_atomic(path, content, private=private)
+
+    monkeypatch.setattr(home_module, "write_atomic", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Home.create(tmp_path / "a", "drone-1")
+    monkeypatch.undo()
+    home = Home.create(tmp_path / "a", "drone-1")
+    keys = read_request((tmp_path / "a" / "request.pem").read_bytes())
+    assert (keys.common_name, keys.signing) == ("drone-1", home.signing_key.public_key())
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import stat
 import time
+import types
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,7 +14,8 @@ from members import POLICY, Fleet
 
 from tutelage.sgc import keyring as keyring_module
 from tutelage.sgc.epochs import CLOCK_TOLERANCE, Epoch, Epochs, read_epochs
-from tutelage.sgc.errors import NoKey, NotAllowed
+from tutelage.sgc.errors import KeysError, NoKey, NotAllowed
+from tutelage.sgc.grants import Exchange
 from tutelage.sgc.home import Home
 from tutelage.sgc.keyring import Keyring
 from tutelage.sgc.reasons import Reason, Refused
@@ -72,6 +75,34 @@ def test_a_damaged_file_of_keys_is_asked_for_again(fleet: Fleet) -> None:
     again = Keyring(Home.open(fleet.homes["server"].path))
     assert again.epoch("camera") is None
     assert "camera" in again.wanted()
+
+
+def test_a_folder_of_keys_that_was_removed_is_made_again(fleet: Fleet) -> None:
+    """The owner must be able to change its keys; who it is does not depend on that folder."""
+    give(fleet, "server")
+    for name in ("drone-1", "server"):
+        shutil.rmtree(fleet.homes[name].path / "keys")
+    (push,) = fleet.keyrings["drone-1"].rotate("camera")
+    fleet.keyrings["server"].accept("camera", push.grant)
+    folder = fleet.homes["server"].path / "keys"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    shutil.rmtree(folder)
+    folder.write_text("")
+    with pytest.raises(KeysError, match=r"cannot make the folder \S+keys: File exists; move away what is there"):
+        give(fleet, "server")
+
+
+def test_a_member_that_asks_with_an_impossible_key_is_refused_and_stops_no_change_of_keys(fleet: Fleet) -> None:
+    """A point of low order cannot be sealed to; nobody else may be left without the next key because of it."""
+    owner, member = fleet.keyrings["drone-1"], fleet.keyrings["server"]
+    give(fleet, "server")
+    for point in (bytes(32), b"\1" + bytes(31)):
+        public = types.SimpleNamespace(public_bytes_raw=lambda point=point: point)
+        evil = Exchange(member.home.access.entry("camera")).ask(member.home, bytes(16), public)
+        assert reason(owner.answer, "camera", evil) == Reason.MALFORMED
+    (push,) = owner.rotate("camera")
+    member.accept("camera", push.grant)
+    assert member.sealing("camera", time.time() + 3.0).key == owner.sealing("camera", time.time() + 3.0).key
 
 
 def test_nothing_in_a_request_or_grant_can_be_read_by_a_carrier(fleet: Fleet) -> None:

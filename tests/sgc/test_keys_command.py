@@ -6,6 +6,7 @@ import os
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -178,6 +179,74 @@ def test_mistakes_with_a_fleet_at_hand_are_one_line(keys: Keys, fails: Keys) -> 
     Path("fleet/policy.toml").write_text("version = 1\nrenewals = 'nobody'\n")
     keys("issue fleet --policy drone")
     assert "the policy of acme names no node for renewals" in fails("renew drone")
+
+
+def test_mixed_up_folders_files_and_options_change_nothing_and_are_named(keys: Keys, fails: Keys) -> None:
+    keys("init fleet --fleet acme")
+    keys("init drone --node drone-1")
+    keys("init server --node server")
+    assert "fleet holds the authority of a fleet already" in fails("init fleet --node drone-2")
+    assert "drone is the home of a node already" in fails("init drone --fleet other")
+    assert "cannot make the folder fleet/policy.toml: File exists; choose another" in fails(
+        "init fleet/policy.toml --node a"
+    )
+    assert "cannot read nofile" in fails("issue fleet drone nofile")
+    assert "fleet/policy.toml: not a signing request" in fails("issue fleet drone fleet/policy.toml")
+    assert "drone-1" not in keys("show fleet")  # one that cannot be read stops the others, too
+    keys("issue fleet drone server")
+    authority = Path("fleet/ca.key").read_bytes()
+    assert "fleet is the folder of an authority; --bundle and --authority" in fails("renew fleet --bundle fleet/outbox/deny")
+    assert "fleet is the folder of an authority; --bundle and --authority" in fails("renew fleet --authority fleet")
+    assert Path("fleet/ca.key").read_bytes() == authority
+    assert "drone is the folder of drone-1; --root-key, " in fails("renew drone --authority fleet --revoke-old")
+    assert "drone-1 does not take fleet/outbox/server.bundle: sealed to another node, or damaged; it needs" in fails(
+        "renew drone --bundle fleet/outbox/server.bundle"
+    )
+    assert "acme has no member 'nobody'" in fails("revoke fleet drone-1 nobody")
+    assert "revoked" not in keys("show fleet")
+
+
+def test_a_certificate_that_expired_is_not_renewed_over_the_network_and_the_way_out_is_named(
+    keys: Keys, fails: Keys
+) -> None:
+    keys("init fleet --fleet acme")
+    keys("init drone --node drone-1")
+    keys("issue fleet drone --hours 0.001")
+    time.sleep(3.7)
+    assert "nobody on the network believes it: use --bundle, with what tutelage keys issue gives, or --authority" in fails(
+        "renew drone"
+    )
+    keys("renew drone --authority fleet")
+    assert "names no node for renewals" in fails("renew drone")
+
+
+def test_a_node_that_believes_another_root_is_named(keys: Keys, fails: Keys) -> None:
+    keys("init fleet --fleet acme")
+    keys("init other --fleet other")
+    keys("init drone --node drone-1 --root other/root.pem")
+    assert "drone does not take fleet/outbox/drone-1.bundle, the certificate of drone-1: a cert" in fails(
+        "issue fleet drone"
+    )
+    Path("fleet/root.pem").write_bytes(Path("other/root.pem").read_bytes())
+    assert "fleet is damaged: ca.pem does not come from root.pem; restore it" in fails("issue fleet drone")
+
+
+def test_names_in_a_policy_that_are_no_nodes_are_said(keys: Keys, fails: Keys) -> None:
+    keys("init fleet --fleet acme")
+    keys("init drone --node drone-1")
+    keys("init hub --router hub --address 127.0.0.1")
+    Path("fleet/policy.toml").write_text(POLICY)
+    said = keys("issue fleet drone hub --policy")
+    assert "the policy names operator-1, server, no members of acme yet" in said or "the policy names server, no" in said
+    Path("fleet/policy.toml").write_text(POLICY.replace('owner = "drone-1"', 'owner = "hub"', 1))
+    assert "fleet/policy.toml: owner of " in (line := fails("issue fleet --policy"))
+    assert "is hub, a router; only nodes have a part in it" in line
+    Path("fleet/policy.toml").write_text("version = 1\nrenewals = 'hub'\n")
+    assert "fleet/policy.toml: renewals is hub, a router" in fails("issue fleet --policy")
+    Path("fleet/published.toml").unlink()
+    assert "acme has no signed policy (no fleet/published.toml): tutelage keys issue fleet --policy" in fails(
+        "issue fleet drone"
+    )
 
 
 def test_without_the_extra_the_verbs_name_it(tmp_path) -> None:

@@ -354,3 +354,12 @@ def test_a_sealer_asks_for_its_key_when_it_has_none(tmp_path) -> None:
     with pytest.raises(NoKey, match="drone-2 has no valid key for camera"):
         fleet.sealer("drone-2", "camera").seal(b"x")
     assert keyring_module.Keyring(fleet.homes["drone-2"]).wanted() == ["camera", "grasp", "lidar"]
+
+
+def test_a_bundle_that_is_damaged_while_a_node_runs_costs_no_message(own_fleet: Fleet, caplog) -> None:
+    """What was believed before stays in force; `send` must not raise for it."""
+    sealer, opener = own_fleet.pair("camera", "drone-1", "server")
+    own_fleet.homes["drone-1"].path.joinpath("bundle").write_bytes(b"?")
+    (message,) = receive(opener, sealer.seal(b"on"))
+    assert (message.payload, message.sequence) == (b"on", 1)
+    assert "holds a file of drone-1 that cannot be believed" in caplog.text

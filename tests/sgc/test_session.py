@@ -6,11 +6,13 @@ import struct
 import time
 
 import pytest
+from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from members import POLICY, Fleet
 
 from tutelage.sgc.errors import NotAllowed
-from tutelage.sgc.packet import HEADER, MODES, make_header
+from tutelage.sgc.packet import HEADER, MODES, make_header, message_key
 from tutelage.sgc.reasons import Reason, Refused
+from tutelage.sgc.rules import Lane
 from tutelage.sgc.session import MAX_SESSIONS
 
 
@@ -168,3 +170,33 @@ def test_other_topics_have_no_sessions(fleet: Fleet) -> None:
     with pytest.raises(NotAllowed, match='camera has authenticity "signature" in the policy, so it has no sessions'):
         fleet.sealer("drone-1", "camera").accept_session(offer)
     assert len(set(MODES.values())) == 3
+
+
+def test_what_a_message_is_bound_to_is_under_the_tag_of_the_session(fleet: Fleet) -> None:
+    """A member knows the topic's key, so it can find other bytes for which the tag of AES-GCM is the same: two blocks that
+    differ by x and x * H cancel in GHASH. The session's tag must not let them pass."""
+
+    def times(x: int, y: int) -> int:  # in GF(2^128), as GHASH counts its bits
+        product = 0
+        for bit in range(127, -1, -1):
+            product ^= x if y >> bit & 1 else 0
+            x = x >> 1 ^ (0xE1 << 120 if x & 1 else 0)
+        return product
+
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    bind = bytes(range(40))
+    packet = sealer.seal(b"yes", bind=bind)
+    _, _, _, _, _, epoch, sender, salt, _, _ = struct.unpack(">BBHHHI16s16sQQ", packet[:HEADER])
+    entry = fleet.homes["server"].access.entry("teleop")
+    epoch_key = fleet.keyrings["server"].opening("teleop", epoch).key
+    key = message_key(epoch_key, bytes(entry.name), Lane.STREAM, epoch, sender, salt)
+    encryptor = Cipher(algorithms.AES(key), modes.ECB()).encryptor()
+    h = int.from_bytes(encryptor.update(bytes(16)), "big")
+    difference = bytes(4) + (1).to_bytes(16, "big") + times(1, h).to_bytes(16, "big") + bytes(4)
+    other = bytes(a ^ b for a, b in zip(bind, difference, strict=True))
+    with pytest.raises(Refused) as raised:
+        opener.open(packet, bind=other)
+    assert raised.value.reason == Reason.FORGED
+    with pytest.raises(Refused):
+        opener.open(packet)
+    assert opener.open(packet, bind=bind).payload == b"yes"

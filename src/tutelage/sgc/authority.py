@@ -37,7 +37,7 @@ from tutelage.sgc.envelope import derive
 from tutelage.sgc.errors import KeysError
 from tutelage.sgc.names import SECRET_BYTES, Name
 from tutelage.sgc.policy import TEMPLATE, Policy, routes
-from tutelage.sgc.privatekeys import load_signing_key, save_key
+from tutelage.sgc.privatekeys import holds, key_pem, load_signing_key, make_folder, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.roster import Roster
 from tutelage.sgc.rules import NODE_NAME, Role
@@ -57,6 +57,11 @@ class Authority:
         """Use `Authority.open`."""
         self.path = path
         self._lock = Lock(path / ".lock")
+        self._files: dict[Path, bytes | None] = {}  # what a change will write (None: remove) once the list is saved
+        self._read()
+
+    def _read(self) -> None:
+        path = self.path
         try:
             self._roster = Roster.load(path / "state.json")
             self._secret = (path / "names.secret").read_bytes()
@@ -72,6 +77,10 @@ class Authority:
             ) from None
         except (OSError, ValueError, TypeError) as error:
             raise KeysError(f"{path} is damaged: {error}; restore it from a copy") from None
+        try:
+            self._certificate.verify_directly_issued_by(self._root)
+        except certificates.UNREADABLE:
+            raise KeysError(f"{path} is damaged: ca.pem does not come from root.pem; restore it from a copy") from None
 
     @classmethod
     def create(cls, path: Path, fleet: str, *, passphrase: bytes | None = None) -> Authority:
@@ -84,10 +93,11 @@ class Authority:
         """
         if not NODE_NAME.fullmatch(fleet):
             raise KeysError(f"a fleet's name is 1 to 63 letters, digits, '.', '_' and '-', not {fleet!r}")
-        if (path / "state.json").exists():
+        if holds(path, "state.json"):
             raise KeysError(f"{path} holds the authority of a fleet already; choose another folder")
-        path.mkdir(parents=True, exist_ok=True)
-        os.chmod(path, 0o700)
+        if holds(path, "node.json"):
+            raise KeysError(f"{path} is the home of a node already; choose another folder")
+        make_folder(path)
         root_key = Ed25519PrivateKey.generate()
         public, now = root_key.public_key(), time.time()
         root = certificates.authority_certificate(f"{fleet} root", public, None, root_key, now, ROOT_DAYS)
@@ -97,7 +107,9 @@ class Authority:
         write_atomic(path / "names.secret", secrets.token_bytes(SECRET_BYTES), private=True)
         write_atomic(path / "policy.toml", TEMPLATE.encode())
         write_atomic(path / "published.toml", TEMPLATE.encode())
-        _certify(path, fleet, root, root_key)
+        key, certificate = _certify(fleet, root, root_key)
+        save_key(path / "ca.key", key)
+        write_atomic(path / "ca.pem", certificates.pem(certificate))
         Roster(path / "state.json", fleet).save()
         return cls(path)
 
@@ -139,12 +151,21 @@ class Authority:
     def unsigned(self) -> bool:
         """Has the policy file changed since `publish`?"""
         file, signed = self.path / "policy.toml", self.path / "published.toml"
-        return file.is_file() and file.read_bytes() != signed.read_bytes()
+        try:
+            return file.is_file() and not (signed.is_file() and file.read_bytes() == signed.read_bytes())
+        except OSError as error:
+            raise KeysError(f"cannot read {error.filename}: {error.strerror}") from None
+
+    def strangers(self) -> list[str]:
+        """Names in the policy that was published that are no members: yet to come, or misspelt."""
+        policy = self._policy()
+        names = {name for rule in policy.topics.values() for name in rule.names()} | {policy.renewals} - {""}
+        return sorted(names - self._roster.members.keys())
 
     def refresh(self) -> None:
         """Read again what another process changed."""
         with self._lock:
-            self._roster = Roster.load(self.path / "state.json")
+            self._read()
 
     def renew_own(self, root_key: Path | None = None, passphrase: bytes | None = None, *, revoke_old: bool = False) -> None:
         """A new key and certificate for the authority itself; leaves that the old one signed stay valid until they expire.
@@ -167,9 +188,11 @@ class Authority:
             raise KeysError(f"cannot read the root key {path}: {error}") from None
         if key.public_key() != self._root.public_key():
             raise KeysError(f"{path} is not the root key of {self.fleet}")
-        with self._changing():
+        with self._changing(renews=True):
             old = fingerprint(self._certificate)
-            self._key, self._certificate = _certify(self.path, self.fleet, self._root, key)
+            self._key, self._certificate = _certify(self.fleet, self._root, key)
+            self._files[self.path / "ca.key"] = key_pem(self._key)
+            self._files[self.path / "ca.pem"] = certificates.pem(self._certificate)
             if revoke_old:
                 self._roster.revoked_authorities.append(old)
                 self._roster.deny_serial += 1
@@ -221,24 +244,32 @@ class Authority:
         Raises:
             ConfigError: the policy file has a fault; nothing is changed.
         """
-        Policy.load(self.path / "policy.toml")
+        _check_hours(hours)
+        policy = Policy.load(self.path / "policy.toml")
         with self._changing():
-            write_atomic(self.path / "published.toml", (self.path / "policy.toml").read_bytes())
+            named = {f"owner of {alias!r}": rule.owner for alias, rule in policy.topics.items()}
+            for what, name in {"renewals": policy.renewals, **named}.items():
+                if name in self.routers:
+                    raise KeysError(f"{self.path / 'policy.toml'}: {what} is {name}, a router; only nodes have a part in it")
+            self._files[self.path / "published.toml"] = (self.path / "policy.toml").read_bytes()
             self._roster.serial += 1
             return {name: self._bundle(name, hours) for name in list(self._roster.members)}
 
-    def revoke(self, name: str) -> bytes:
-        """Put a node on the deny list; the signed list, also in outbox/, is for everybody's `Home.accept`.
+    def revoke(self, *names: str) -> bytes:
+        """Put nodes on the deny list; the signed list, also in outbox/, is for everybody's `Home.accept`.
 
         Raises:
-            KeysError: no such node.
+            KeysError: one of them is no member; nobody is revoked.
         """
         with self._changing():
-            if name not in self._roster.members:
+            if unknown := sorted(set(names) - self._roster.members.keys()):
                 known = ", ".join(sorted(self._roster.members)) or "none"
-                raise KeysError(f"{self.fleet} has no member {name!r}; members: {known}")
-            self._roster.revoke(name)
-            (self.path / "outbox" / f"{name}.bundle").unlink(missing_ok=True)
+                gone = unknown[0] in (name for name, _ in self._roster.revoked.values())
+                what = "has revoked" if gone else "has no member"
+                raise KeysError(f"{self.fleet} {what} {unknown[0]!r}{' already' * gone}; members: {known}")
+            for name in dict.fromkeys(names):
+                self._roster.revoke(name)
+                self._files[self.path / "outbox" / f"{name}.bundle"] = None
             notice = self._write_deny_list()
             self._write_for_routers()
             return notice
@@ -278,15 +309,18 @@ class Authority:
         )
 
     def _policy(self) -> Policy:
-        return Policy.load(self.path / "published.toml")
+        path = self.path / "published.toml"
+        content = self._files.get(path)
+        if content is None and not path.is_file():
+            raise KeysError(f"{self.fleet} has no signed policy (no {path}): tutelage keys issue {self.path} --policy")
+        return Policy.load(path) if content is None else Policy.parse(content.decode())
 
     def _topic_secret(self, canonical: bytes) -> bytes:
         return hmac.digest(self._secret, pack(b"tutelage topic secret 1", canonical), hashlib.sha256)
 
     def _bundle(self, name: str, hours: float) -> bytes:
         """Certificate, membership and part of the policy for a member; also written to outbox/."""
-        if not 0 < hours <= 24 * 366:
-            raise KeysError(f"a certificate is for more than 0 and at most 8784 hours, not {hours:g}")
+        _check_hours(hours)
         record = self._roster.members[name]
         keys = replace(record.keys, common_name=record.pseudonym)
         leaf = certificates.leaf_certificate(keys, self._certificate, self._key, time.time(), hours)
@@ -300,13 +334,13 @@ class Authority:
             deny=self.deny_notice(),
         ).seal(keys.sealing, self._key)
         self._roster.issued(record.name, leaf.not_valid_after_utc.timestamp())
-        write_atomic(self.path / "outbox" / f"{record.name}.bundle", bundle)
+        self._files[self.path / "outbox" / f"{record.name}.bundle"] = bundle
         return bundle
 
     def _write_deny_list(self) -> bytes:
         notice = self.deny_notice()
         if notice:
-            write_atomic(self.path / "outbox" / "deny", notice)
+            self._files[self.path / "outbox" / "deny"] = notice
         return notice
 
     def _write_for_routers(self) -> None:
@@ -316,20 +350,39 @@ class Authority:
                 self._bundle(record.name, LEAF_HOURS)
 
     @contextmanager
-    def _changing(self) -> Iterator[None]:
-        """Another process may serve renewals meanwhile: read, change and write under a lock."""
+    def _changing(self, *, renews: bool = False) -> Iterator[None]:
+        """Another process may serve renewals meanwhile: read, change and write under a lock. Files are written at the end,
+        after the list that they follow from: what was interrupted has changed nothing, or is whole when it is done again.
+
+        renews: the change is a new key of the authority itself.
+        """
         with self._lock:
-            self._roster = Roster.load(self.path / "state.json")
-            yield
-            self._roster.save()
+            self._read()
+            if not renews and self._key.public_key() != self._certificate.public_key():
+                again = f"tutelage keys renew {self.path}"
+                raise KeysError(f"{self.path}: the renewal of the authority was interrupted; do it again: {again}")
+            self._files = {}
+            try:
+                yield
+                self._roster.save()
+                for path, content in self._files.items():
+                    if content is None:
+                        path.unlink(missing_ok=True)
+                    else:
+                        write_atomic(path, content, private=path.suffix == ".key")
+            except BaseException:
+                self._read()
+                raise
+            finally:
+                self._files = {}
 
 
-def _certify(
-    path: Path, fleet: str, root: x509.Certificate, root_key: Ed25519PrivateKey
-) -> tuple[Ed25519PrivateKey, x509.Certificate]:
+def _check_hours(hours: float) -> None:
+    if not 0 < hours <= 24 * 366:
+        raise KeysError(f"a certificate is for more than 0 and at most 8784 hours, not {hours:g}")
+
+
+def _certify(fleet: str, root: x509.Certificate, root_key: Ed25519PrivateKey) -> tuple[Ed25519PrivateKey, x509.Certificate]:
     key = Ed25519PrivateKey.generate()
     name = f"{fleet} authority"
-    certificate = certificates.authority_certificate(name, key.public_key(), root, root_key, time.time(), AUTHORITY_DAYS)
-    save_key(path / "ca.key", key)
-    write_atomic(path / "ca.pem", certificates.pem(certificate))
-    return key, certificate
+    return key, certificates.authority_certificate(name, key.public_key(), root, root_key, time.time(), AUTHORITY_DAYS)

@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from tutelage.errors import ConfigError
+from tutelage.sgc.envelope import sealing_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import NODE_NAME, Role
 
@@ -118,7 +119,7 @@ def read_request(pem: bytes) -> Keys:
         genuine = asked.is_signature_valid
         keys = _keys(asked)
     except UNREADABLE as error:
-        raise Refused(Reason.MALFORMED, f"not a signing request: {error}") from None
+        raise Refused(Reason.MALFORMED, f"not a signing request: {str(error).partition('. See')[0]}") from None
     if not NODE_NAME.fullmatch(keys.common_name):
         raise Refused(Reason.MALFORMED, f"a signing request for the impossible name {keys.common_name!r}")
     if not genuine:
@@ -226,8 +227,7 @@ def _keys(holder: x509.Certificate | x509.CertificateSigningRequest) -> Keys:
         addresses = tuple(str(name.value) for name in names)
     except x509.ExtensionNotFound:
         addresses = ()
-    sealing = X25519PublicKey.from_public_bytes(extension.value[1:])
-    return Keys(str(common_name.value), _ROLES[extension.value[0]], signing, sealing, addresses)
+    return Keys(str(common_name.value), _ROLES[extension.value[0]], signing, sealing_key(extension.value[1:]), addresses)
 
 
 def _general_names(addresses: Sequence[str]) -> list[x509.GeneralName]:

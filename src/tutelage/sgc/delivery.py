@@ -33,11 +33,16 @@ SLACK = 0.1
 """Seconds by which a stream may be older than our subscription and still count as begun after it."""
 
 
+TWICE_NS = 5_000_000_000
+"""An earlier start of a sender that still sends so long after the next one began runs beside it."""
+
+
 @dataclass(slots=True)
 class Stream:
     """The messages of one start of a sender.
 
     Attributes:
+        began: when its first message that we heard was sent, nanoseconds since 1970.
         next: sequence number that is to be delivered next.
         held: messages that wait behind a gap, by sequence number.
         since: when there last was progress, while there is a gap; None without one.
@@ -49,6 +54,7 @@ class Stream:
 
     sender: str
     salt: bytes
+    began: int
     next: int
     held: dict[int, Opened] = field(default_factory=dict)
     size: int = 0
@@ -91,6 +97,8 @@ class Delivery(ABC):
         self.patience = patience
         self.from_first_heard = from_first_heard
         self.tally = Tally()
+        self.twice: set[str] = set()
+        """Senders of which two programs send at once: only the one that began later is heard."""
         self._current: dict[str, Stream] = {}
         self._past: deque[bytes] = deque(maxlen=256)  # salts of earlier starts
 
@@ -137,6 +145,8 @@ class Delivery(ABC):
         if stream is not None and stream.salt == message.salt:
             return stream, []
         if message.salt in self._past:
+            if stream is not None and message.sent > stream.began + TWICE_NS:
+                self.twice.add(message.sender)
             return None, []
         left = []
         if stream is not None:
@@ -145,7 +155,9 @@ class Delivery(ABC):
         # Begun after us: whatever came before this message was meant for us too.
         ours = not self.from_first_heard and age_of(message.payload) <= now - self.started + SLACK
         first = 1 if ours else message.sequence
-        stream = self._current[message.sender] = Stream(message.sender, message.salt, first, patience=self.patience)
+        stream = self._current[message.sender] = Stream(
+            message.sender, message.salt, message.sent, first, patience=self.patience
+        )
         return stream, left
 
     def _release_all(self, stream: Stream, now: float) -> list[Opened]:

@@ -15,6 +15,7 @@ from tutelage.sgc.reasons import Reason, Refused
 
 _SUITE = hpke.Suite(hpke.KEM.X25519, hpke.KDF.HKDF_SHA256, hpke.AEAD.AES_256_GCM)
 _NONCE = 12
+_PROBE = X25519PrivateKey.generate()
 
 
 def seal_to(key: X25519PublicKey, info: bytes, plaintext: bytes) -> bytes:
@@ -23,6 +24,17 @@ def seal_to(key: X25519PublicKey, info: bytes, plaintext: bytes) -> bytes:
     info: what it is, and for what; the reader must name the same.
     """
     return _SUITE.encrypt(plaintext, key, info)
+
+
+def sealing_key(raw: bytes) -> X25519PublicKey:
+    """A public key of a stranger, if it is one that can be sealed to: with a point of low order there is no shared secret.
+
+    Raises:
+        ValueError: not such a key.
+    """
+    key = X25519PublicKey.from_public_bytes(raw)
+    _PROBE.exchange(key)
+    return key
 
 
 def open_sealed(key: X25519PrivateKey, info: bytes, sealed: bytes) -> bytes:

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 
 from tutelage.sgc.access import Entry
 from tutelage.sgc.certificates import raw
-from tutelage.sgc.envelope import Curtain, open_sealed, seal_to
+from tutelage.sgc.envelope import Curtain, open_sealed, seal_to, sealing_key
 from tutelage.sgc.epochs import Epoch, read_epochs
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Reason, Refused
@@ -80,7 +80,10 @@ class Exchange:
         if name != self.entry.name or len(nonce) != NONCE_BYTES or len(reply_to) != 32:
             raise Refused(Reason.MALFORMED, f"a request of {member.node} for the key of another topic")
         self.check_member(member)
-        return Asker(member, X25519PublicKey.from_public_bytes(reply_to)), nonce
+        try:
+            return Asker(member, sealing_key(reply_to)), nonce
+        except ValueError:
+            raise Refused(Reason.MALFORMED, f"a request of {member.node} with an impossible key") from None
 
     def check_member(self, member: Member) -> None:
         """May it hold the topic's key?

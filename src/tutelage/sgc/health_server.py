@@ -7,6 +7,9 @@ another five minutes; else 503. The body says why, in JSON.
 from __future__ import annotations
 
 import json
+import logging
+import re
+import sys
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -15,6 +18,17 @@ from typing import Any, Self
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.health import Tree, prometheus
+
+log = logging.getLogger(__name__)
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that hangs up, or says nothing, is none of our faults; anything else is logged."""
+        if not isinstance(sys.exception(), OSError):
+            log.exception("health, as asked by %s", client_address)
 
 
 class HealthServer:
@@ -29,7 +43,7 @@ class HealthServer:
             ConfigError: the address is impossible or in use.
         """
         host, _, port = address.rpartition(":")
-        if not host or not port.isdigit() or int(port) > 65535:
+        if not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
             raise ConfigError(f"{address!r} is no address to serve health on; write HOST:PORT, such as 127.0.0.1:9090")
 
         class Handler(BaseHTTPRequestHandler):
@@ -57,10 +71,10 @@ class HealthServer:
                 return
 
         try:
-            self._server = ThreadingHTTPServer((host.strip("[]"), int(port)), Handler)
-        except OSError as error:
-            raise ConfigError(f"cannot serve health on {address}: {error.strerror}") from None
-        self._server.daemon_threads = True
+            self._server = _Server((host.strip("[]"), int(port)), Handler)
+        except (OSError, UnicodeError) as error:  # a name with a label that is too long is no text for the resolver
+            why = error.strerror if isinstance(error, OSError) else error
+            raise ConfigError(f"cannot serve health on {address}: {why}") from None
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="sgc-health", daemon=True)
         self._thread.start()
 

@@ -14,7 +14,6 @@ keys/           of topics, a file an alias, sealed to this node
 from __future__ import annotations
 
 import json
-import os
 import threading
 import time
 from collections.abc import Sequence
@@ -30,7 +29,7 @@ from tutelage.sgc import certificates
 from tutelage.sgc.access import Access
 from tutelage.sgc.bundle import Bundle, is_bundle
 from tutelage.sgc.errors import KeysError, NotIssued
-from tutelage.sgc.privatekeys import load_sealing_key, load_signing_key, save_key
+from tutelage.sgc.privatekeys import holds, load_sealing_key, load_signing_key, make_folder, save_key
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import NODE_NAME, Role
 from tutelage.sgc.trust import Member, Trust
@@ -91,24 +90,27 @@ class Home:
         """
         if not NODE_NAME.fullmatch(name):
             raise KeysError(f"a node's name is 1 to 63 letters, digits, '.', '_' and '-', not {name!r}")
-        if (path / "node.json").exists():
+        if holds(path, "node.json"):
             raise KeysError(f"{path} is the home of a node already; choose another folder")
+        if holds(path, "state.json"):
+            raise KeysError(f"{path} holds the authority of a fleet already; choose another folder")
         if role == Role.ROUTER:
             certificates.check_addresses(addresses)
         elif addresses:
             raise KeysError(f"{name} is a node, and nodes only dial out: addresses are for routers")
         believed = None if root is None else _read_root(root)
-        path.mkdir(parents=True, exist_ok=True)
-        os.chmod(path, 0o700)
+        make_folder(path)
         if believed is not None:
             write_atomic(path / "root.pem", certificates.pem(believed))
-        save_key(path / "signing.key", Ed25519PrivateKey.generate())
-        save_key(path / "sealing.key", X25519PrivateKey.generate())
+        signing, sealing = Ed25519PrivateKey.generate(), X25519PrivateKey.generate()
+        save_key(path / "signing.key", signing)
+        save_key(path / "sealing.key", sealing)
+        keys = certificates.Keys(name, role, signing.public_key(), sealing.public_key(), tuple(addresses))
+        write_atomic(path / "request.pem", certificates.request(keys, signing))
         content = {"format": _FORMAT, "name": name, "role": str(role), "addresses": list(addresses)}
+        # The last, as a folder with it is a home: what was interrupted is begun anew.
         write_atomic(path / "node.json", (json.dumps(content, indent=1) + "\n").encode())
-        home = cls(path)
-        write_atomic(path / "request.pem", home.request())
-        return home
+        return cls(path)
 
     @classmethod
     def open(cls, path: Path) -> Home:
@@ -272,8 +274,12 @@ class Home:
             self._seen = seen
             try:
                 self._read()
-            except Refused as error:
-                raise KeysError(f"{self.path} holds a file that cannot be believed: {error}") from None
+            except (Refused, OSError) as error:
+                what = f"cannot read {error.filename}: {error.strerror}" if isinstance(error, OSError) else error
+                raise KeysError(
+                    f"{self.path} holds a file of {self.name} that cannot be believed: {what}; remove its files bundle and "
+                    f"deny, and have it issued again (tutelage keys issue)"
+                ) from None
             self.version += 1
             return True
 

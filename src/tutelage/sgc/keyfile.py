@@ -5,17 +5,34 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from pathlib import Path
 
 from tutelage.files import Lock, write_atomic
 from tutelage.sgc.access import Entry
 from tutelage.sgc.envelope import open_sealed, seal_to
 from tutelage.sgc.epochs import Epoch, Epochs
+from tutelage.sgc.errors import KeysError
 from tutelage.sgc.grants import Exchange
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Refused
 from tutelage.sgc.trust import Member
 
 _CONTEXT = b"tutelage topic keys 1"
+
+
+class _Folder(Lock):
+    """The lock of a folder of keys, which is made anew if somebody removed it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path / ".lock")
+        self._folder = path
+
+    def __enter__(self) -> None:
+        try:
+            self._folder.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            raise KeysError(f"cannot make the folder {self._folder}: {error.strerror}; move away what is there") from None
+        super().__enter__()
 
 
 class TopicKeys:
@@ -35,13 +52,12 @@ class TopicKeys:
         self.exchange = Exchange(entry)
         self.epochs = Epochs()
         self.path = home.path / "keys" / f"{entry.rule.alias}.keys"
-        self.lock = Lock(self.path.parent / ".lock")
+        self.lock = _Folder(self.path.parent)
         self.owner: Member | None = None
         self._owner = ""
         self._sealing = home.sealing_key
         self._made_under: list[int | str] = []
         self._seen = 0
-        self.path.parent.mkdir(mode=0o700, exist_ok=True)
         self.refresh()
 
     def current(self, now: float) -> list[Epoch]:

@@ -173,7 +173,7 @@ class Opener:
             return self._anchor(stream, BARE_PROOF, raw, packet[end:], member, now)
         body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
         if self._mode == SESSION:
-            member = self._session_member(stream, raw, packet, end, now)
+            member = self._session_member(stream, raw, packet, end, bind, now)
         else:
             member = self._member(stream, raw, packet[HEADER:start], now)
         node, epoch, salt, authentic, began = member.node, stream.epoch, stream.salt, self._authentic, stream.start
@@ -273,12 +273,12 @@ class Opener:
         self._check(member, now)
         return member
 
-    def _session_member(self, stream: _Stream, raw: bytes, packet: Buffer, end: int, now: int) -> Member:
+    def _session_member(self, stream: _Stream, raw: bytes, packet: Buffer, end: int, bind: bytes, now: int) -> Member:
         """Who the sender is, from the tag that it made for us."""
         for at in range(end, len(packet), SLOT):
             session = self._sessions.get(stream.start + packet[at : at + SESSION_ID])
             if session is not None and now < session.until:
-                session.check(raw, packet[:end], packet[at + SESSION_ID : at + SLOT])
+                session.check(raw, packet[:end], packet[at + SESSION_ID : at + SLOT], bind)
                 if session.member is not stream.member:  # else `_look_at_stream` has checked it
                     self._check(session.member, now)
                 return session.member

@@ -56,7 +56,7 @@ _COUNT = struct.Struct(">I")
 BATCH, ANCHOR, BARE = 1, 2, 4
 """Flags: the body holds many messages; the proof confirms earlier ones too; there is no message, only a proof."""
 
-BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG = (purpose.to_bytes(4, "big") for purpose in range(6))
+BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG, BOUND_TAG = (p.to_bytes(4, "big") for p in range(7))
 """What a nonce is for: the first 4 of its 12 bytes, so that one sequence number serves several without repetition."""
 
 

@@ -7,7 +7,6 @@ this one again within a second, and what they missed is replayed.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import socket
 import threading
@@ -154,11 +153,15 @@ class Router:
             where = ", ".join(map(str, self.config.listen))
             raise ConfigError(f"{self.home.name} cannot listen on {where}: {str(error).split(' at /')[0]}") from None
         self._session = session
-        self.starts += 1
         inner = self._listen[-1].port
-        for each in self.config.listen:
-            if each.protocol in ("ws", "wss"):
-                self._tunnels.append(TunnelServer(each, inner, self._identity))
+        try:
+            for each in self.config.listen:
+                if each.protocol in ("ws", "wss"):
+                    self._tunnels.append(TunnelServer(each, inner, self._identity))
+        except BaseException:
+            self._end()  # all of it or nothing: what is left would be in the way of the next attempt
+            raise
+        self.starts += 1
         deny = lanes.key(self.home.access.control, lanes.DENY)
         session.declare_subscriber(deny, self._zenoh.handlers.Callback(self._on_deny, indirect=True))
         rules = lanes.key(self.home.access.control, lanes.RULES)
@@ -205,10 +208,12 @@ class Router:
         """Start again when the folder calls for other rules, or holds a new certificate."""
         expires = self.home.expires
         while not self._closed.wait(FOLLOW):
-            with contextlib.suppress(TutelageError):
-                self.home.refresh()
             try:
-                if self.home.expires == expires and self.rules() == self._rules:
+                self.home.refresh()
+            except TutelageError as error:
+                log.warning("%s", error)
+            try:
+                if self.running and self.home.expires == expires and self.rules() == self._rules:
                     continue
                 log.info("%s starts again with other rules or a new certificate", self.home.name)
                 expires = self.home.expires

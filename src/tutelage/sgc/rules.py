@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -61,6 +60,7 @@ _WHO = ("publish", "subscribe", "serve", "request")
 _OF_KIND = {Kind.STREAM: ("publish", "subscribe"), Kind.SERVICE: ("serve", "request")}
 _KNOWN = (*_METADATA, "owner", "kind", *_WHO, "authenticity", "delivery", "max_age", "rotate_every")
 MIN_ROTATE, MAX_ROTATE = 1.0, 30 * 86400.0
+MAX_AGE = 366 * 86400.0
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,11 @@ class TopicRule:
     def is_member(self, node: str) -> bool:
         """May this node hold the topic's key: owner, or sender or receiver on any lane?"""
         return node == self.owner or any(_any(node, getattr(self, who)) for who in _WHO)
+
+    def names(self) -> set[str]:
+        """All nodes that the rule names, patterns left out."""
+        named = {self.owner, *(name for who in _WHO for name in getattr(self, who))}
+        return {name for name in named if NODE_NAME.fullmatch(name)}
 
     def lanes(self) -> tuple[Lane, ...]:
         """STREAM for a stream, REQUEST and REPLY for a service; PRESENCE for both."""
@@ -158,7 +163,7 @@ class TopicRule:
             kind=kind,
             authenticity=_choice(where, table, "authenticity", Authenticity, Authenticity.SIGNATURE),
             delivery=_choice(where, table, "delivery", Delivery, Delivery.RELIABLE),
-            max_age=_seconds(where, table, "max_age", 1e-3, math.inf) if "max_age" in table else None,
+            max_age=_seconds(where, table, "max_age", 1e-3, MAX_AGE) if "max_age" in table else None,
             rotate_every=_seconds(where, table, "rotate_every", MIN_ROTATE, MAX_ROTATE)
             if "rotate_every" in table
             else 3600.0,
@@ -202,7 +207,6 @@ def _choice(where: str, table: Mapping[str, Any], field: str, kind: type[_Choice
 
 def _seconds(where: str, table: Mapping[str, Any], field: str, low: float, high: float) -> float:
     value = table[field]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not (low <= value <= high) or math.isinf(value):
-        limits = f"at least {low:g}" + ("" if math.isinf(high) else f" and at most {high:g}")
-        raise ConfigError(f"{where}: {field} must be {limits} seconds, not {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ConfigError(f"{where}: {field} must be at least {low:g} and at most {high:g} seconds, not {value!r}")
     return float(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 import time
@@ -11,7 +12,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.chain import ANCHOR_SECONDS, Link
-from tutelage.sgc.errors import NotAllowed
+from tutelage.sgc.errors import KeysError, NotAllowed
 from tutelage.sgc.grants import key_id
 from tutelage.sgc.keyring import Keyring
 from tutelage.sgc.packet import (
@@ -45,6 +46,8 @@ from tutelage.sgc.packet import (
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.rules import Lane
 from tutelage.sgc.session import Handshake, Session, tags
+
+log = logging.getLogger(__name__)
 
 _SIGNATURE = 64
 _SMALL = 16_384  # bytes up to which copying is cheaper than writing in place
@@ -217,7 +220,7 @@ class Sealer:
         self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Buffer, now: int
     ) -> bytes:
         if self._mode == SESSION:
-            return tags(self._sessions, header, sealed)
+            return tags(self._sessions, header, sealed, bind)
         statement = self._statements.message(header, bind, body)
         key = self._home.signing_key
         # A signature is sealed too: in clear, anyone who knows a node's certificate could tell which packets are its own.
@@ -238,7 +241,10 @@ class Sealer:
         if self._cipher is not None and self._looked <= now < self._look_at and versions == self._versions:
             return self._cipher
         seconds = now / 1e9
-        self._home.refresh()
+        try:
+            self._home.refresh()
+        except KeysError as error:  # what was believed before stays in force, and nothing is lost
+            log.warning("%s", error)
         self._home.check(seconds)
         self._entry = self._home.access.check(self.alias, self.lane, sends=True)
         if self._entry.name != self._name or self._entry.rule.authenticity_on(self.lane) != self._authenticity:

@@ -21,7 +21,7 @@ from tutelage.sgc.access import Entry
 from tutelage.sgc.envelope import Curtain, derive
 from tutelage.sgc.grants import MAX_CONTROL, NONCE_BYTES, key_id
 from tutelage.sgc.home import Home
-from tutelage.sgc.packet import MAX_SESSIONS, SESSION_TAG, Buffer, nonce
+from tutelage.sgc.packet import BOUND_TAG, MAX_SESSIONS, SESSION_TAG, Buffer, nonce
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import Lane, Role
 from tutelage.sgc.signed import sign, verified
@@ -49,14 +49,15 @@ class Session:
     until: int
     cipher: AESGCM
 
-    def check(self, header: bytes, sealed: Buffer, tag: Buffer) -> None:
-        """Was the tag made by the other end? It is over header and ciphertext, which are both in `sealed`.
+    def check(self, header: bytes, sealed: Buffer, tag: Buffer, bind: bytes = b"") -> None:
+        """Was the tag made by the other end? It is over header and ciphertext, which are both in `sealed`, and `bind`.
 
         Raises:
             Refused: FORGED.
         """
         try:
-            self.cipher.decrypt(nonce(SESSION_TAG, header), tag, sealed)
+            once, about = _about(header, sealed, bind)
+            self.cipher.decrypt(once, tag, about)
         except InvalidTag:
             raise Refused(Reason.FORGED, f"a tag that is not by {self.member.node}") from None
 
@@ -154,7 +155,16 @@ class Handshake:
         return Session(material[32:], member, until, AESGCM(material[:32]))
 
 
-def tags(sessions: list[Session], header: bytes, sealed: Buffer) -> bytes:
-    """The proof of a packet: id and tag of every session, made over header and ciphertext, which are both in `sealed`."""
-    once = nonce(SESSION_TAG, header)
-    return b"".join([session.ident + session.cipher.encrypt(once, b"", sealed) for session in sessions])
+def tags(sessions: list[Session], header: bytes, sealed: Buffer, bind: bytes = b"") -> bytes:
+    """The proof of a packet: id and tag of every session, made over header and ciphertext, which are both in `sealed`, and
+    what the packet is bound to."""
+    once, about = _about(header, sealed, bind)
+    return b"".join([session.ident + session.cipher.encrypt(once, b"", about) for session in sessions])
+
+
+def _about(header: bytes, sealed: Buffer, bind: bytes) -> tuple[bytes, Buffer]:
+    """Nonce, and what is tagged. `bind` is part of it, although it is under the tag of the ciphertext already: who knows the
+    topic's key, as all members do, finds another one with the same tag there."""
+    if not bind:
+        return nonce(SESSION_TAG, header), sealed
+    return nonce(BOUND_TAG, header), b"".join((sealed, bind, len(bind).to_bytes(4, "big")))

@@ -117,6 +117,7 @@ class Subscription:
         self._held: deque[tuple[float, bytes]] = deque(maxlen=HELD_PACKETS)
         self._asked: dict[str, float] = {}
         self._last_refusal: Reason | None = None
+        self._twice: set[str] = set()  # senders of which it was said that two programs send at once
         self._offer_at = float("inf")
         self._direct = direct
         self._turn = threading.Lock()  # whose turn it is to deal with packets, if direct: the network's thread or our own
@@ -298,7 +299,19 @@ class Subscription:
         if not opened:
             return []
         self._heard(opened[-1], received)
-        return self._assembler.messages(self.delivery.accept_all(opened, time.monotonic()), received)
+        ready = self.delivery.accept_all(opened, time.monotonic())
+        if len(self.delivery.twice) > len(self._twice):
+            self._say_twice()
+        return self._assembler.messages(ready, received)
+
+    def _say_twice(self) -> None:
+        for sender in sorted(self.delivery.twice - self._twice):
+            log.warning(
+                "two programs send %s as %s at once, and only the one that began later is heard: end them and start one, "
+                "or give the other a node of its own (tutelage keys init HOME --node NAME)",
+                self.alias, sender,
+            )  # fmt: skip
+        self._twice = set(self.delivery.twice)
 
     def _heard(self, opened: Opened, received: float) -> None:
         sender, took = opened.sender, received - opened.sent * 1e-9

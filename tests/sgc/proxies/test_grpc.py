@@ -328,6 +328,27 @@ def _certificates(folder):
         make(name, *authority)
 
 
+def test_files_that_cannot_serve_for_tls_are_named(company, tmp_path):
+    _certificates(tmp_path)
+    _, app = company(POLICY, "robot", "app")
+    server, key, junk = tmp_path / "server.pem", tmp_path / "server.key", tmp_path / "junk"
+    junk.write_text("junk")
+    with pytest.raises(ConfigError, match=r"cannot use \S+junk with \S+server.key"):
+        Gateway(app, tls=Tls(junk, key))
+    with pytest.raises(ConfigError, match=r"cannot use \S+junk as an authority"):
+        Gateway(app, tls=Tls(server, key, junk))
+    with pytest.raises(ConfigError, match=r"leaf.pem is Ed25519, .*; use ECDSA or RSA"):
+        Gateway(app, tls=Tls(app.home.leaf_file, app.home.key_file))
+    locked = serialization.load_pem_private_key(key.read_bytes(), None).private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.BestAvailableEncryption(b"secret")
+    )
+    key.write_bytes(locked)
+    with pytest.raises(ConfigError, match=r"cannot use \S+server.pem with \S+server.key"):  # and nobody is asked
+        Gateway(app, tls=Tls(server, key))
+    with pytest.raises(ConfigError, match="names no socket; write unix:PATH"):
+        Gateway(app, listen="unix:")
+
+
 def test_tls_with_certificates_of_the_clients(company, generated, tmp_path):
     _certificates(tmp_path)
     _, app = company(POLICY, "robot", "app")

@@ -134,3 +134,6 @@ def test_the_file_is_named(robot, tmp_path):
     file.write_text('version = 1\n[[topic]]\nalias = "camera"\nqueue = 0\n')
     with pytest.raises(ConfigError, match=r"routes.toml: topic camera: queue must be from 1"):
         load_routes(file, robot)
+    file.write_text("version = 1\n")
+    with pytest.raises(ConfigError, match=r"routes.toml: nothing is listed; list what is to be carried under"):
+        load_routes(file, robot)

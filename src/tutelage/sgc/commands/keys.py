@@ -38,13 +38,13 @@ def init(
 
     Args:
         folder: where.
-        fleet: name of a new fleet: makes its root, its authority and a policy to fill in.
+        fleet: name of a new fleet: makes its root, its authority and a policy to fill in. This, node or router is needed.
         node: name of a node: makes its keys and a signing request.
         router: name of a router, likewise.
-        address: IP addresses and host names at which others reach the router.
-        connect: routers that the node dials, such as tls/192.0.2.7:7447, for its network.toml.
-        root: root.pem of the fleet; the node then believes no other, not even at first.
-        passphrase_file: its content encrypts the root's key.
+        address: IP addresses and host names at which others reach the router, which needs one at least; a node has none.
+        connect: routers that the node dials, such as tls/192.0.2.7:7447, for its network.toml; without it, write that file.
+        root: root.pem of the fleet; the node then believes no other. Without it, it believes the root of its first bundle.
+        passphrase_file: its content encrypts the root's key; without it, the key lies there in clear.
     """
     _need()
     from tutelage.sgc.rules import Role
@@ -79,12 +79,17 @@ def issue(
     Args:
         authority: folder of the fleet's authority.
         requests: signing requests of nodes and routers; of a node's folder on this machine, the answer is put there at once.
+            None: only the policy is signed, with --policy.
         policy: sign policy.toml as it now is: a new bundle for every member.
         hours: validity of the certificates.
     """
+    from tutelage.sgc.reasons import Refused
+
     fleet = _authority(authority)
     if not requests and not policy:
         raise ConfigError("name signing requests (tutelage keys init --node NAME makes them), or --policy")
+    pems = [_request(each) for each in requests]  # all of them first: one that is damaged stops the others, too
+    names = [_name_of(pem) for pem in pems]
     if policy:
         bundles = fleet.publish(hours=hours)
         _say(f"policy {fleet.roster.serial} of {fleet.fleet} is signed; {len(bundles)} bundles in {authority / 'outbox'}")
@@ -93,19 +98,21 @@ def issue(
             _say(f"    tutelage keys renew HOME --bundle {authority / 'outbox'}/NAME.bundle")
     elif fleet.unsigned:
         _say(f"{authority / 'policy.toml'} has changed since it was signed, and holds for nobody yet; add --policy")
-    names = []
-    for request in requests:
-        pem = _read(request / "request.pem" if request.is_dir() else request)
-        names.append(_name_of(pem))
+    for pem in pems:
         fleet.issue(pem, hours=hours)
     for request, name in zip(requests, names, strict=True):  # only now: bundles of routers name all new nodes
         bundle = authority / "outbox" / f"{name}.bundle"
         if request.is_dir():
-            _home(request).accept(bundle.read_bytes())
+            try:
+                _home(request).accept(bundle.read_bytes())
+            except Refused as refused:
+                raise ConfigError(f"{request} does not take {bundle}, the certificate of {name}: {refused}") from None
             _say(f"{name}: certificate for {hours:g} hours, installed in {request}")
         else:
             _say(f"{name}: certificate for {hours:g} hours in {bundle}; on the node:")
             _say(f"    tutelage keys renew HOME --bundle {name}.bundle")
+    if policy and (strangers := fleet.strangers()):
+        _say(f"the policy names {', '.join(strangers)}, no members of {fleet.fleet} yet")
     for name in sorted(set(fleet.routers) - set(names)) if requests else ():
         _say(f"{name}: the router must hear of them: tutelage keys renew HOME --bundle {authority / 'outbox' / name}.bundle")
 
@@ -123,16 +130,20 @@ def renew(
 
     Args:
         home: the node's folder; of an authority: a new key and certificate for itself, signed by the root.
-        bundle: what the authority gave: a bundle or a deny list.
-        authority: folder of the fleet's authority on this machine.
+        bundle: what the authority gave: a bundle or a deny list; without it and --authority, it is asked for on the network.
+        authority: folder of the fleet's authority on this machine, which signs at once.
         hours: validity, with --authority.
-        root_key: for an authority: where the root's key is, if not in its folder.
-        passphrase_file: for an authority: the passphrase of the root's key.
+        root_key: for an authority: where the root's key is; without it, root/root.key in its folder.
+        passphrase_file: for an authority: the passphrase of the root's key; without it, the key is in clear.
         revoke_old: for an authority whose key was stolen: refuse all that it signed; all nodes need their new bundles.
     """
     _need()
-    if (home / "state.json").exists():
+    from tutelage.sgc.privatekeys import holds
+
+    if holds(home, "state.json"):
         fleet = _authority(home)
+        if bundle is not None or authority is not None:
+            raise ConfigError(f"{home} is the folder of an authority; --bundle and --authority are for a node's")
         fleet.renew_own(root_key, _passphrase(passphrase_file), revoke_old=revoke_old)
         _say(f"the authority of {fleet.fleet} has a new key, valid until {_when(fleet.certificate.not_valid_after_utc)}")
         if revoke_old:
@@ -141,13 +152,18 @@ def renew(
     from tutelage.sgc.reasons import Reason, Refused
 
     node = _home(home)
+    if root_key is not None or passphrase_file is not None or revoke_old:
+        raise ConfigError(
+            f"{home} is the folder of {node.name}; --root-key, --passphrase-file, --revoke-old: an authority's"
+        )
     if bundle is not None:
         try:
             what = node.accept(_read(bundle))
         except Refused as refused:
             if refused.reason == Reason.MALFORMED:
                 raise ConfigError(f"{bundle} is neither a bundle nor a deny list, or is damaged: {refused}") from None
-            raise
+            needs = f"it needs the newest outbox/{node.name}.bundle (or deny) of its own fleet's authority"
+            raise ConfigError(f"{node.name} does not take {bundle}: {refused}; {needs}") from None
         if what == "deny":
             _say(
                 f"{node.name} knows deny list {node.trust.deny_list.serial}: {len(node.trust.deny_list.pseudonyms)} revoked"
@@ -170,8 +186,7 @@ def revoke(authority: Positional[Path], nodes: Positional[tuple[str, ...]]) -> N
     fleet = _authority(authority)
     if not nodes:
         raise ConfigError("name at least one node")
-    for name in nodes:
-        fleet.revoke(name)
+    fleet.revoke(*nodes)
     _say(f"deny list {fleet.roster.deny_serial} of {fleet.fleet}: {', '.join(nodes)} revoked; routers have new bundles too")
     _say(f"it reaches running nodes by itself if tutelage keys serve runs; else carry {authority / 'outbox' / 'deny'}, and:")
     _say("    tutelage keys renew HOME --bundle deny")
@@ -184,10 +199,12 @@ def show(what: Positional[Path]) -> None:
         what: a node's folder, an authority's, or a signing request.
     """
     _need()
+    from tutelage.sgc.privatekeys import holds
+
     if what.is_file():
-        pem = _read(what)
+        pem = _request(what)
         _say(f"signing request of {_name_of(pem)}, fingerprint {_fingerprint(pem)}")
-    elif (what / "state.json").exists():
+    elif holds(what, "state.json"):
         _show_authority(_authority(what))
     else:
         _show_home(_home(what))
@@ -203,6 +220,7 @@ def serve(authority: Positional[Path], home: Positional[Path], hours: float = 24
     """
     fleet, node_home = _authority(authority), _home(home)
     from tutelage.sgc import lanes
+    from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.node import Node
     from tutelage.sgc.office import Office
 
@@ -213,11 +231,10 @@ def serve(authority: Positional[Path], home: Positional[Path], hours: float = 24
             f"then: tutelage keys issue {authority} --policy"
         )
     office = Office(fleet, node_home, hours=hours)
-    with Node.open(node_home) as node:
+    with until_stopped() as stop, Node.open(node_home) as node:
         node.transport.serve(lanes.key(node.access.control, lanes.RENEW), office.answer)
         _say(f"{node.name} renews certificates of {fleet.fleet}; Ctrl-C ends it")
-        while True:
-            time.sleep(1.0)
+        stop.wait()
 
 
 VERBS = {"init": init, "issue": issue, "renew": renew, "revoke": revoke, "show": show, "serve": serve}
@@ -242,6 +259,11 @@ def _renew_by_network(home: Home) -> None:
     from tutelage.sgc.transport.config import Identity, NetworkConfig
     from tutelage.sgc.transport.zenoh import ZenohTransport
 
+    if home.expires < time.time():
+        raise ConfigError(
+            f"the certificate of {home.name} has expired, so nobody on the network believes it: use --bundle, with what "
+            f"tutelage keys issue gives, or --authority"
+        )
     home.check()
     if home.access.renewals is None:
         raise ConfigError(
@@ -322,6 +344,19 @@ def _home(folder: Path) -> Home:
 def _need() -> None:
     if _MISSING is not None:
         raise _MISSING
+
+
+def _request(path: Path) -> bytes:
+    """A signing request, or that of a node's folder; one that can be read."""
+    from tutelage.sgc.reasons import Refused
+
+    file = path / "request.pem" if path.is_dir() else path
+    pem = _read(file)
+    try:
+        _name_of(pem)
+    except Refused as refused:
+        raise ConfigError(f"{file}: {refused}; a node's is the request.pem of its folder") from None
+    return pem
 
 
 def _name_of(pem: bytes) -> str:

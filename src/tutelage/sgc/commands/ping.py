@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from tutelage.sgc.node import Node
 
 
+MAX_SECONDS = 3600.0
+"""Of interval and timeout."""
+
+
 def ping(
     home: Positional[Path],
     nodes: Positional[tuple[str, ...]] = (),
@@ -34,8 +38,11 @@ def ping(
     from tutelage.sgc.node import Node
     from tutelage.sgc.transport.base import NoReply
 
-    if count < 1 or interval < 0 or timeout <= 0:
-        raise ConfigError("ping needs a count of at least 1, an interval of at least 0 s and a timeout of more than 0 s")
+    if count < 1 or not 0 <= interval <= MAX_SECONDS or not 0 < timeout <= MAX_SECONDS:
+        raise ConfigError(
+            f"ping needs a count of at least 1, an interval of at least 0 s and a timeout of more than 0 s, both at most "
+            f"{MAX_SECONDS:g} s"
+        )
     with Node.open(home) as node:
         _wait_for_network(node, timeout)
         asked = list(nodes) or _present(node, timeout)

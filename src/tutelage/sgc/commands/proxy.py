@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from tutelage.sgc.proxies.routes import Routes
 
 
+MAX_SECONDS = 86400.0
+"""To listen to discovery."""
+
+
 class _Proxy(Protocol):
     def counters(self) -> dict[str, Any]: ...
 
@@ -27,7 +31,7 @@ def ros2(home: Positional[Path], routes: Positional[Path], health: str | None = 
     Args:
         home: the node's folder (tutelage keys).
         routes: the list, a TOML file; see the documentation. What is not listed stays on its domain.
-        health: HOST:PORT at which to serve /healthz and /metrics.
+        health: HOST:PORT at which to serve /healthz and /metrics; without it, neither is served.
     """
     from tutelage.sgc.proxies.ros2 import Ros2Proxy
     from tutelage.sgc.proxies.routes import load_routes
@@ -58,13 +62,16 @@ def rosbridge(
         home: the node's folder (tutelage keys).
         listen: HOST:PORT; beyond this machine it needs TLS, and a token or client certificates.
         routes: which topics and services, and under which names (TOML); default: all of the node's, by the policy's names.
-        types: folders of .msg and .srv files, laid out as <package>/msg/*.msg, for types that are not standard.
-        origins: pages, such as https://operators.example, whose scripts may connect; those of this machine always may.
-        token_file: clients must bring this file's content, as "Authorization: Bearer ..." or "?token=...".
-        certificate: PEM, for TLS (wss://).
-        key: PEM, the certificate's.
-        clients: PEM, an authority; clients must have a certificate of it.
-        health: HOST:PORT at which to serve /healthz and /metrics.
+        types: folders of .msg and .srv files, laid out as <package>/msg/*.msg, for types that are not standard; none: the
+            standard types, and those of the ROS 2 installation in AMENT_PREFIX_PATH.
+        origins: pages, such as https://operators.example, whose scripts may connect; those of this machine always may, and
+            without origins only those.
+        token_file: clients must bring this file's content, as "Authorization: Bearer ..." or "?token=..."; without it they
+            need none.
+        certificate: PEM, for TLS (wss://); without it, plain WebSocket, on loopback only.
+        key: PEM, the certificate's; needed with it.
+        clients: PEM, an authority; clients must have a certificate of it. Without it they need none.
+        health: HOST:PORT at which to serve /healthz and /metrics; without it, neither is served.
     """
     from tutelage.sgc.proxies.listen import parse_address, read_token
     from tutelage.sgc.proxies.ros_types import RosTypes
@@ -95,11 +102,13 @@ def grpc(
     Args:
         home: the node's folder (tutelage keys).
         listen: HOST:PORT or unix:PATH; beyond this machine it needs TLS, and a token or client certificates.
-        token_file: clients must bring this file's content in the metadata, as "authorization: Bearer ...".
-        certificate: PEM, for TLS. Not the node's own: gRPC's library does not take Ed25519.
-        key: PEM, the certificate's.
-        clients: PEM, an authority; clients must have a certificate of it.
-        health: HOST:PORT at which to serve /healthz and /metrics.
+        token_file: clients must bring this file's content in the metadata, as "authorization: Bearer ..."; without it they
+            need none.
+        certificate: PEM, for TLS; without it, plain text, on this machine only. Not the node's own: gRPC's library does not
+            take Ed25519.
+        key: PEM, the certificate's; needed with it.
+        clients: PEM, an authority; clients must have a certificate of it. Without it they need none.
+        health: HOST:PORT at which to serve /healthz and /metrics; without it, neither is served.
     """
     from tutelage.sgc.proxies.grpc import Gateway
     from tutelage.sgc.proxies.listen import read_token
@@ -129,6 +138,8 @@ def topics(domain: int = 0, seconds: float = 3.0) -> None:
 
     if not 0 <= domain <= MAX_DOMAIN:
         raise ConfigError(f"DDS domains go from 0 to {MAX_DOMAIN}, not {domain}")
+    if not 0 <= seconds <= MAX_SECONDS:
+        raise ConfigError(f"one can listen for 0 to {MAX_SECONDS:g} seconds, not {seconds:g}")
     with Domain(domain) as joined:
         found = discover(joined, seconds)
     if not found:

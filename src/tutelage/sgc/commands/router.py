@@ -19,8 +19,8 @@ def router(
     Args:
         home: the router's folder (tutelage keys init --router).
         listen: addresses, protocol/host:port with one of tls, quic, ws, wss.
-        mesh: addresses of other routers to join.
-        health: HOST:PORT at which to serve /healthz and /metrics.
+        mesh: addresses of other routers to join; none: it stands alone, unless others name it.
+        health: HOST:PORT at which to serve /healthz and /metrics; without it, neither is served.
     """
     from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.health import router_counters, router_health

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from tutelage.sgc.subscription import Subscription
 
 
+MAX_SECONDS = 3600.0
+"""Between two looks."""
+
+
 @dataclass
 class Heard:
     """Of one sender on one topic, since the last look."""
@@ -51,8 +55,8 @@ def top(
     from tutelage.sgc.commands.stopping import until_stopped
     from tutelage.sgc.node import Node
 
-    if interval <= 0 or count < 0:
-        raise ConfigError("top needs an interval of more than 0 s and a count of at least 0")
+    if not 0 < interval <= MAX_SECONDS or count < 0:
+        raise ConfigError(f"top needs an interval of more than 0 and at most {MAX_SECONDS:g} s, and a count of at least 0")
     console = Console(markup=False, width=None if sys.stdout.isatty() else 160)
     with contextlib.ExitStack() as stack:
         node = stack.enter_context(Node.open(home))

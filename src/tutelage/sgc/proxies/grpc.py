@@ -10,6 +10,9 @@ import asyncio
 import threading
 from typing import TYPE_CHECKING, Any
 
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
 from tutelage.errors import ConfigError, MissingExtraError
 from tutelage.sgc.proxies.listen import Tls, check_listen, has_token, parse_address
 
@@ -43,8 +46,12 @@ class Gateway:
             import grpc.aio
         except ImportError:
             raise MissingExtraError("grpcio", "grpc") from None
+        if listen == "unix:":
+            raise ConfigError("'unix:' names no socket; write unix:PATH")
         if not listen.startswith("unix:"):
             check_listen("a gRPC gateway", parse_address(listen)[0], token, tls)
+        if tls is not None:
+            _check(tls)
         self._listen, self._token, self._tls = listen, token, tls
         self._server: grpc.aio.Server | None = None
         self._calls: Calls | None = None
@@ -149,3 +156,13 @@ def _token_check(token: str) -> Any:
             return await continuation(details) if has_token(given, token) else refusal
 
     return TokenCheck()
+
+
+def _check(tls: Tls) -> None:
+    """gRPC's library says of files that it cannot use only that it cannot listen."""
+    tls.context()
+    public = x509.load_pem_x509_certificate(tls.certificate.read_bytes()).public_key()
+    if isinstance(public, Ed25519PublicKey):
+        raise ConfigError(
+            f"{tls.certificate} is Ed25519, as the nodes' own are, which gRPC's library does not take; use ECDSA or RSA"
+        )

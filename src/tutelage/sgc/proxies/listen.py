@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +32,25 @@ class Tls:
         except OSError as error:
             raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
 
+    def context(self) -> ssl.SSLContext:
+        """For a server of the standard library.
+
+        Raises:
+            ConfigError: a file cannot be read, or they do not belong together.
+        """
+        self.read()  # for its error
+        try:
+            context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=self.clients)
+        except ssl.SSLError as error:
+            raise ConfigError(f"cannot use {self.clients} as an authority: {error.reason or error}") from None
+        try:
+            context.load_cert_chain(self.certificate, self.key, password="")  # one with a passphrase must not ask for it
+        except ssl.SSLError as error:
+            raise ConfigError(f"cannot use {self.certificate} with {self.key}: {error.reason or error}") from None
+        if self.clients is not None:
+            context.verify_mode = ssl.CERT_REQUIRED
+        return context
+
 
 def parse_address(address: str) -> tuple[str, int]:
     """HOST:PORT, also [IPv6]:PORT.
@@ -38,7 +59,7 @@ def parse_address(address: str) -> tuple[str, int]:
         ConfigError: it is none.
     """
     host, colon, port = address.rpartition(":")
-    if not host or not colon or not port.isdigit() or int(port) > 65535:
+    if not host or not colon or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
         raise ConfigError(f"{address!r} is no address; write HOST:PORT, such as 127.0.0.1:9090")
     return host.strip("[]"), int(port)
 

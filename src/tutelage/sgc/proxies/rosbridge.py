@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import http
 import logging
-import ssl
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -127,7 +126,7 @@ class Bridge:
                 max_queue=4,
                 close_timeout=1,
                 compression=None,
-                ssl=_ssl(tls) if tls is not None else None,
+                ssl=tls.context() if tls is not None else None,
                 logger=logging.getLogger(f"{__name__}.websockets"),
             )
         except OSError as error:
@@ -214,15 +213,3 @@ class Bridge:
         self._pool.shutdown(wait=False, cancel_futures=True)
         if not self._thread.is_alive():
             self.loop.close()
-
-
-def _ssl(tls: Tls) -> ssl.SSLContext:
-    tls.read()  # for its error
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=tls.clients)
-    try:
-        context.load_cert_chain(tls.certificate, tls.key)
-    except ssl.SSLError as error:
-        raise ConfigError(f"cannot use {tls.certificate} with {tls.key}: {error}") from None
-    if tls.clients is not None:
-        context.verify_mode = ssl.CERT_REQUIRED
-    return context

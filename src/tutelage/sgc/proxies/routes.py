@@ -127,6 +127,8 @@ def parse_routes(content: Mapping[str, Any], access: Access) -> Routes:
         topics += more_topics
         services += more_services
     table.finish()
+    if not topics and not services:
+        raise ConfigError("nothing is listed; list what is to be carried under [[topic]], [[service]] or [[action]]")
     _refuse_twice([f"topic {t.name} of domain {t.domain} with alias {t.alias}" for t in topics])
     _refuse_twice([f"service {s.name} of domain {s.domain}" for s in services])
     return Routes(tuple(topics), tuple(services), distribution)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tutelage.errors import ConfigError, MissingExtraError
+from tutelage.files import write_atomic
 
 if TYPE_CHECKING:
     import zenoh
@@ -142,7 +143,7 @@ class NetworkConfig:
         if changed:
             lines += ["", "[timers]", *(f"{name} = {value}" for name, value in changed.items())]
         path = folder / FILE
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_atomic(path, ("\n".join(lines) + "\n").encode())
         return path
 
 
