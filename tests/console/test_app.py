@@ -71,6 +71,9 @@ def test_admins_manage_accounts(running: Running) -> None:
         assert rows["dora"]["role"] == "viewer"
         assert rows["dora"]["last_login"] is None
         assert "password" not in rows["dora"]
+        assert client.patch("/api/accounts/dora", json={"role": "operator", "password": "short"}).status_code == 400
+        rows = {row["name"]: row for row in client.get("/api/accounts").json()["rows"]}
+        assert rows["dora"]["role"] == "viewer", "a change that is refused changes nothing"
         assert client.patch("/api/accounts/dora", json={"role": "operator", "password": PASSWORD}).status_code == 200
         with contextlib.closing(running.client("dora")) as dora:
             assert dora.get("/api/me").json()["role"] == "operator"
