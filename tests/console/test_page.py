@@ -268,6 +268,10 @@ def test_the_emergency_stop_and_its_end_are_whole_on_every_screen(
                 box = ada.see(button).bounding_box()
                 assert 0 <= box["x"] < box["x"] + box["width"] <= width, f"{button} is cut off at {path}"
             assert ada.page.evaluate("document.documentElement.scrollWidth") <= width, f"{path} is wider than the screen"
+        ada.go("/")
+        ada.see(".tile-name")
+        cut = "[...document.querySelectorAll('.tile-name')].filter(e => e.scrollWidth > e.clientWidth).length"
+        assert ada.page.evaluate(cut) == 0, "the names of robots are cut off"
 
 
 def test_a_phone_on_its_side_shows_picture_stick_and_give_back_together(browser: Any, served: Served) -> None:
