@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import threading
 import time
 from pathlib import Path
@@ -70,6 +71,9 @@ def test_admins_manage_accounts(running: Running) -> None:
         assert rows["dora"]["role"] == "viewer"
         assert rows["dora"]["last_login"] is None
         assert "password" not in rows["dora"]
+        assert client.patch("/api/accounts/dora", json={"role": "operator", "password": "short"}).status_code == 400
+        rows = {row["name"]: row for row in client.get("/api/accounts").json()["rows"]}
+        assert rows["dora"]["role"] == "viewer", "a change that is refused changes nothing"
         assert client.patch("/api/accounts/dora", json={"role": "operator", "password": PASSWORD}).status_code == 200
         with contextlib.closing(running.client("dora")) as dora:
             assert dora.get("/api/me").json()["role"] == "operator"
@@ -112,6 +116,14 @@ def test_health_and_numbers_for_this_machine(running: Running) -> None:
     assert float(numbers["tutelage_online"]) == 4
     assert "tutelage_console_sockets" in numbers
     assert all(float(value) == float(value) for value in numbers.values())
+
+
+def test_prometheus_takes_every_name_and_gets_every_digit(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [{"t": 12345678, "loss/risk": 0.25, "time": 1795381200.5}]  # one bad name and Prometheus takes none
+    monkeypatch.setattr(running.supervision, "metrics", lambda since=0: rows)
+    lines = [line for line in httpx.get(f"{running.origin}/metrics").text.splitlines() if not line.startswith("#")]
+    assert all(re.fullmatch(r"[a-zA-Z_:][a-zA-Z0-9_:]* \S+", line) for line in lines)
+    assert {"tutelage_fleet_t 12345678", "tutelage_fleet_loss_risk 0.25", "tutelage_fleet_time 1795381200.5"} <= set(lines)
 
 
 # -- the live socket --------------------------------------------------------------------------------------------

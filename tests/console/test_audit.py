@@ -229,6 +229,10 @@ def test_an_older_copy_of_the_folder_is_found_by_a_noted_hash_only(
     assert not verify_folder(old, noted).ok
 
 
+def test_a_hash_that_was_noted_before_the_first_row_is_in_every_record(folder: Path) -> None:
+    assert verify_folder(folder, bytes(32)).ok
+
+
 def test_a_record_that_was_cut_off_is_not_continued(folder: Path) -> None:
     change(folder, "DELETE FROM record WHERE id > 7")
     with pytest.raises(RecordError, match="cut off or rewritten"):

@@ -253,6 +253,39 @@ def test_a_thumb_drives_on_a_phone(browser: Any, served: Served) -> None:
         page.wait_for_selector(".stage-mine", state="detached")
 
 
+@pytest.mark.parametrize("size", [(320, 568), (390, 844), (667, 375), (844, 390), (1024, 768), (1181, 800)])
+def test_the_emergency_stop_and_its_end_are_whole_on_every_screen(
+    browser: Any, served: Served, size: tuple[int, int]
+) -> None:
+    width, height = size
+    with person(browser, served.origin, "ada", **PHONE | {"viewport": {"width": width, "height": height}}) as ada:
+        ada.page.get_by_role("button", name="Emergency stop: all robots").tap()
+        ada.see(".banner-stop")
+        for path in ("/", "/accounts", "/audit", "/robot/1"):
+            ada.go(path)
+            ada.page.wait_for_timeout(300)
+            for button in (".estop", ".clear-stop"):
+                box = ada.see(button).bounding_box()
+                assert 0 <= box["x"] < box["x"] + box["width"] <= width, f"{button} is cut off at {path}"
+            assert ada.page.evaluate("document.documentElement.scrollWidth") <= width, f"{path} is wider than the screen"
+        ada.go("/")
+        ada.see(".tile-name")
+        cut = "[...document.querySelectorAll('.tile-name')].filter(e => e.scrollWidth > e.clientWidth).length"
+        assert ada.page.evaluate(cut) == 0, "the names of robots are cut off"
+
+
+def test_a_phone_on_its_side_shows_picture_stick_and_give_back_together(browser: Any, served: Served) -> None:
+    with person(browser, served.origin, "ana", **PHONE | {"viewport": {"width": 667, "height": 375}}) as ana:
+        take(ana, 1)
+        ana.see_picture()
+        end = ana.see(".tabs").bounding_box()["y"]
+        give_back = ana.page.get_by_role("button", name="Give back")
+        boxes = [ana.see(".view").bounding_box(), ana.see(".stick svg").bounding_box(), give_back.bounding_box()]
+        assert all(box["y"] >= 48 and box["y"] + box["height"] <= end + 1 for box in boxes), (boxes, end)
+        give_back.tap()
+        ana.page.wait_for_selector(".stage-mine", state="detached")
+
+
 def test_a_press_on_the_picture_drives(browser: Any, served: Served) -> None:
     with person(browser, served.origin, "ana") as ana:
         take(ana, 1)

@@ -139,7 +139,8 @@ def test_one_folder_has_one_server(tmp_path: Path, serving: list[Served]) -> Non
      (["--origin", "robots.example"], "--origin is a scheme and a name"),
      (["--origin", "https://robots.example"], "make an account first: tutelage accounts add NAME --role admin --out "),
      (["--host", "no.such.name.invalid"], "no.such.name.invalid is not this machine's own address"),
-     (["--port", "99999"], "cannot listen on 127.0.0.1 port 99999"),
+     (["--port", "99999"], "--port is from 0 to 65535, not 99999"),
+     (["--port", "-1"], "--port is from 0 to 65535, not -1"),
      (["--fleet", "Navigation"], "unknown fleet 'Navigation' (did you mean sim:Navigation?)"),
      (["--fleet", "sim:NoSuchTask"], "NoSuchTask")],
 )  # fmt: skip
@@ -293,8 +294,39 @@ def test_a_broken_record_is_told_with_its_row(tmp_path: Path) -> None:
     said = tutelage("audit", "verify", tmp_path)
     assert said.returncode == 2
     assert said.stderr == f"tutelage: {tmp_path}: row 1 was altered\n"
-    assert tutelage("audit", "verify", tmp_path, "--noted", "xyz").returncode == 2
     assert "no record" in tutelage("audit", "verify", tmp_path / "nowhere").stderr
+
+
+@pytest.mark.parametrize("noted", ["xyz", "", "00" * 31, "00" * 33])
+def test_half_a_noted_hash_is_no_accusation(tmp_path: Path, noted: str) -> None:
+    tutelage("accounts", "add", "ana", "--out", tmp_path, input=PASSWORD)
+    said = tutelage("audit", "verify", tmp_path, "--noted", noted)
+    assert (said.returncode, said.stderr) == (2, "tutelage: --noted is a hash as this command prints it, 64 digits\n")
+
+
+@pytest.mark.parametrize(
+    "verb", [["serve"], ["accounts", "add"], ["accounts", "password"], ["audit", "verify"], ["study", "run"]]
+)
+def test_help_says_what_happens_without_an_option_that_is_optional(verb: list[str]) -> None:
+    options = re.split(r" --(?=[a-z])", re.sub(r"[\s│]+", " ", tutelage(*verb, "--help").stdout))
+    optional = [option for option in options if option.rstrip(" ╰─╯").endswith("(optional)")]
+    assert optional
+    assert [option for option in optional if "left out:" not in option] == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_ctrl_c_ends_a_server_at_once_and_loses_nothing(tmp_path: Path, serving: list[Served], number: int) -> None:
+    serving.append(server := Served(tmp_path))
+    assert server.process.stdout
+    assert server.process.stderr
+    server.process.send_signal(number)
+    server.process.send_signal(number)  # what runs a server may send it too: still the first one
+    assert server.process.stdout.readline() == "stopping; Ctrl-C again ends it at once\n"
+    time.sleep(0.6)
+    server.process.send_signal(number)
+    err = server.process.communicate(timeout=30)[1]
+    assert (server.process.returncode, err) in ((0, ""), (128 + number, "tutelage: interrupted\n"))
+    assert verify_folder(tmp_path).ok
 
 
 def test_a_server_that_is_interrupted_while_it_prepares_ends_at_once(tmp_path: Path) -> None:

@@ -166,6 +166,7 @@ class TestFullDisk:
                 server.of.command("ann", 1, lease.id, 6, [0.01])
             assert refused.value.code == "held"
             assert "disk full" in server.wait_told(Notice, level="error").text
+            assert "they go on as soon as" in server.wait_told(Notice, level="error").text
             t, before = server.of.engine.loop.t, server.of.engine.loop.obs[:, 0].copy()
             time.sleep(0.4)
             assert server.of.engine.loop.t == t

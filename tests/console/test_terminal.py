@@ -31,6 +31,14 @@ def test_robots_out_of_reach_are_named_when_it_has_settled() -> None:
     assert said == ["robot-2: out of reach", "robot-2: in reach again"]
 
 
+def test_a_stopped_robot_is_not_called_out_of_reach() -> None:
+    said: list[str] = []
+    terminal = Terminal(NAMES, said.append)
+    for time, robots in ((0.0, (1,)), (1.0, (1,)), (2.0, ()), (3.0, ())):
+        terminal.hear(look(time, gone=robots, stopped=robots))
+    assert said == ["robot-2: emergency stop", "robot-2: the stop is cleared"]
+
+
 def test_many_robots_are_counted() -> None:
     said: list[str] = []
     terminal = Terminal(NAMES, said.append)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from tutelage.console.packing import pack, unpack
 from tutelage.console.parts import learner_in, load_learner
 from tutelage.console.trainer import load_weights, weights_of
 from tutelage.console.training import Training
+from tutelage.errors import TutelageError
 from tutelage.learning.imitation import LearnerConfig
 
 SLOW = {"learner": LearnerConfig(every=10**6, batch=32)}
@@ -116,6 +118,19 @@ class TestTraining:
         again = learner_in(tmp_path)
         assert load_learner(tmp_path, again)[0] == training.seen
         assert len(again.dataset) == n
+
+    def test_a_full_disk_at_the_end_is_no_traceback(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        with Serving(learning(tmp_path, learner="none")) as server:
+            server.steps(1)
+        training = Training(tmp_path, learner_in(tmp_path), 0, per_sample=2.0, swap_every=0.0, save_every=1.0)
+
+        def full(*_: object) -> None:
+            raise TutelageError("no space left on the device")
+
+        monkeypatch.setattr(training, "save", full)
+        ours, theirs = Pipe()
+        ours.send_bytes(pack({"quit": np.ones(1)}))
+        training.run(theirs)  # ends; the record has all that matters
 
     def test_weights_travel_whole(self, tmp_path: Path) -> None:
         with Serving(config(tmp_path, priority="C.U.R.")) as server:

@@ -171,6 +171,8 @@ async def change(request: Request, who: Admin, name: str, body: Change) -> dict[
     c = context_of(request)
 
     def apply() -> None:
+        if body.password is not None:
+            c.accounts.passwords.judge(body.password, name)  # before anything is changed: all of it is done, or nothing
         if body.role is not None:
             role = Role.of(body.role)
             c.accounts.set_role(name, role)

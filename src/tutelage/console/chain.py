@@ -96,7 +96,7 @@ def verify(rows: Iterable[Row], head: Head | None, noted: bytes | None = None) -
         head: what the head's file says; None where there is none.
         noted: a hash that somebody noted elsewhere earlier: it must be in the chain.
     """
-    last, count, seen = START, 0, noted is None
+    last, count, seen = START, 0, noted is None or noted == START  # noted when there was no row yet
     for row in rows:
         at = count + 1
         why = ""

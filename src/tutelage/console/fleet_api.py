@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -20,6 +21,8 @@ from tutelage.console.plain import parsed, plain, text_in_pieces
 from tutelage.console.verifying import verify_apart
 
 router = APIRouter()
+_NOT_IN_NAMES = re.compile("[^a-zA-Z0-9_:]")
+"""Prometheus refuses all of an answer in which one name has another character, such as that of loss/risk."""
 Anybody = Annotated[Session, Depends(session_of)]
 Operator = Annotated[Session, Depends(at_least(Role.OPERATOR))]
 Id = Annotated[int, Path(ge=0, lt=2**53)]
@@ -191,4 +194,5 @@ def prometheus(request: Request) -> str:
     if has_webrtc():
         numbers |= {f"tutelage_webrtc_{name}": value for name, value in app.state.peers.counts().items()}
     numbers["tutelage_record_error"] = int(c.audit.error is not None)
-    return "".join(f"# TYPE {name} gauge\n{name} {float(value):g}\n" for name, value in numbers.items())
+    lines = ((_NOT_IN_NAMES.sub("_", name), float(value)) for name, value in numbers.items())
+    return "".join(f"# TYPE {name} gauge\n{name} {value:.15g}\n" for name, value in lines)

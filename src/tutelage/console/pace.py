@@ -87,7 +87,9 @@ class Pace:
         """Nobody moves while nothing can be written down."""
         engine = self._engine
         engine.trouble, engine.people.frozen = reason, True
-        engine.herald.tell(Notice(None, "error", f"robots are held, because nothing can be recorded: {reason}"))
+        what = reason.partition("; ")[0]  # what follows is advice for a run that ended; this one waits
+        said = f"robots are held, because nothing can be recorded: {what}; they go on as soon as it can be written"
+        engine.herald.tell(Notice(None, "error", said))
         while not engine.closing:
             with engine.lock:
                 engine.lock.wait(0.25)

@@ -34,12 +34,17 @@ class Passwords:
         Raises:
             ConfigError: too short, too long, or the name itself.
         """
+        self.judge(password, name)
+        with self._turns:
+            return self._hasher.hash(_normal(password))
+
+    @staticmethod
+    def judge(password: str, name: str) -> None:
+        """Whether somebody may have this password. Raises ConfigError as `hash`."""
         if not SHORTEST <= len(password) <= LONGEST:
             raise ConfigError(f"a password must have {SHORTEST} to {LONGEST} characters")
         if password.casefold() == name.casefold() or len(set(password)) < 4:
             raise ConfigError("that password is too easy to guess")
-        with self._turns:
-            return self._hasher.hash(_normal(password))
 
     def check(self, kept: str | None, password: str) -> bool:
         """Whether it is the password of `kept`; None (no such account) takes as long and is never right."""

@@ -10,6 +10,7 @@ import socket
 import ssl
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from tutelage.console.supervision import Supervision
 
 Say = Callable[[str], None]
+
+ONE_PRESS = 0.5
+"""Seconds within which further signals are the first one again: a terminal and what runs us may both send it."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class WebConfig:
     def check(self) -> None:
         """Raises ConfigError where it cannot work, or certificate and key cannot be used."""
         self.site()
+        if not 0 <= self.port < 2**16:
+            raise ConfigError(f"--port is from 0 to 65535, not {self.port}")
         if self.certificate is None:
             return
         try:
@@ -112,24 +118,49 @@ def uvicorn_config(app: App, host: str, port: int, **options: Any) -> uvicorn.Co
 
 
 class Server(uvicorn.Server):
-    """The web server; Ctrl-C and SIGTERM end it, and what comes after it is still done."""
+    """The web server, without handlers of signals: see `Ending`."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
+        """Not here."""
+        yield
+
+
+class Ending:
+    """What Ctrl-C and SIGTERM do, in the main thread: the first ends the web server, and lets what follows be done; a later
+    one, or one before there is a server, ends the process at once. That loses nothing that is in the record, and a folder
+    that is half prepared is prepared anew; an orderly end would abort, as threads may be in the middle of training.
+
+    Attributes:
+        server: the web server, as soon as it runs.
+    """
+
+    def __init__(self, say: Say) -> None:
+        self.server: Server | None = None
+        self._say, self._began = say, 0.0
+
+    @contextlib.contextmanager
+    def handled(self) -> Iterator[None]:
         """Install the handlers, where this is the main thread, and put the ones before back."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            self.handle_exit(number, frame)
-
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, self._end) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if self.server and self.server.should_exit and now - self._began < ONE_PRESS:
+            return
+        if self.server is None or self.server.should_exit:
+            os.write(sys.stderr.fileno(), b"tutelage: interrupted\n")
+            os._exit(128 + number)
+        self.server.should_exit, self._began = True, now
+        self._say("stopping; Ctrl-C again ends it at once")
 
 
 def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, web: WebConfig, say: Say) -> None:
@@ -155,8 +186,9 @@ def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, w
             raise ConfigError(f"make an account first: tutelage accounts add NAME --role admin --out {out}")
         listening = stack.enter_context(_listen(web.host, web.port))
         audit = stack.enter_context(contextlib.closing(Audit(out)))
-        with _ends_at_once():
-            opened = stack.enter_context(contextlib.closing(open_supervision(audit)))
+        ending = Ending(say)
+        stack.enter_context(ending.handled())
+        opened = stack.enter_context(contextlib.closing(open_supervision(audit)))
         study = None if hasattr(opened, "start") else opened
         supervision = opened.supervision if hasattr(opened, "supervision") else opened
         app = create_app(Context(supervision, accounts, audit, site, host=web.host, study=study))
@@ -167,6 +199,7 @@ def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, w
             supervision.start()
         audit.write("server", "server", action="start", pid=os.getpid())
         _greet(say, site, listening, invitation)
+        ending.server = server
         server.run(sockets=[listening])
         say("stopping: robots hold, everything is written down")
         audit.write("server", "server", action="stop")
@@ -183,17 +216,6 @@ def _greet(say: Say, site: Site, listening: socket.socket, invitation: str | Non
         say(f"console: {address}")
         say("open it in a browser and log in; accounts: tutelage accounts --help")
     say("Ctrl-C ends it")
-
-
-@contextlib.contextmanager
-def _ends_at_once() -> Iterator[None]:
-    """Ctrl-C ends the process, as threads that are in the middle of training would abort an orderly end of the interpreter.
-    A folder that is half prepared is prepared anew."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print("tutelage: interrupted", file=sys.stderr, flush=True)
-        os._exit(130)
 
 
 @contextlib.contextmanager

@@ -33,8 +33,9 @@ class Terminal:
             self._say(event.text)
 
     def _look(self, now: Snapshot) -> None:
+        # A robot that is stopped is not online to the loop, though it may well be in reach.
         for changed, yes, no in (
-            (self._reached.changes(now.online.tolist(), now.time), "in reach again", "out of reach"),
+            (self._reached.changes((now.online | now.stopped).tolist(), now.time), "in reach again", "out of reach"),
             (self._stopped.changes(now.stopped.tolist(), now.time), "emergency stop", "the stop is cleared"),
         ):
             for value, what in ((True, yes), (False, no)):

@@ -107,8 +107,9 @@ class Training:
             while connection.poll(0.0 if messages or self.owed >= 1 else 0.1):
                 messages.append(unpack(connection.recv_bytes()))
                 if "quit" in messages[-1]:
-                    self.read_samples()
-                    self.save()
+                    with contextlib.suppress(TutelageError):  # as below
+                        self.read_samples()
+                        self.save()
                     return
             for k, message in enumerate(messages):
                 self.take_in(message, learn=k >= len(messages) - self.CHUNK)  # when late, only data are taken in

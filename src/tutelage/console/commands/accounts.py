@@ -30,7 +30,7 @@ def add(name: Positional[str], role: RoleName = "operator", out: Path = FOLDER, 
         name: a-z, 0-9, '.', '_', '-'.
         role: viewer (looks), operator (helps and stops robots) or admin (manages accounts too).
         out: folder of the server.
-        password_file: its first line is the password.
+        password_file: its first line is the password; left out: it is asked for, or is the first line of the input.
     """
     from tutelage.console.accounts import Role
 
@@ -87,7 +87,7 @@ def password(name: Positional[str], out: Path = FOLDER, password_file: Path | No
     Args:
         name: whose.
         out: folder of the server.
-        password_file: its first line is the password.
+        password_file: its first line is the password; left out: it is asked for, or is the first line of the input.
     """
     with _open(out) as (accounts, audit):
         if name not in {account.name for account in accounts.all()}:

@@ -34,19 +34,21 @@ def serve(
         fleet: sim:TASK (see tutelage info; or sim:module:function), or net:HOME, remote robots (see tutelage robot).
         robots: N of a simulated fleet.
         humans: M, seats for operators, at most one a robot.
-        priority: which robots ask for help, such as C.U.R.
+        priority: which robots ask for help: terms of C, U, R, G, Random with dots, an algorithm such as ThriftyDAgger, or
+            your own as module:callable.
         queue: who is next: the neediest robot, or the one that asked first.
         hz: timesteps a second.
         lockstep: the simulation waits for the people who hold robots.
-        policy: a run folder to start with its policy; none: an untrained one; default: clone the algorithmic human first.
+        policy: a run folder to start with its policy; none: an untrained one; left out: clone the algorithmic human first.
         learner: beside the loop, within it, or none: the policy stays as it is.
         seed: root seed.
         out: folder of accounts, record, policy and checkpoints; a folder that was served before is continued.
         host: address to listen on; others than this machine's own need a certificate, a key and accounts.
         port: 0: any free one.
-        certificate: PEM file of the server's certificate, for HTTPS.
-        key: PEM file of its private key.
-        origin: how browsers reach the server through a proxy that you run in front of it, such as https://robots.example.
+        certificate: PEM file of the server's certificate, for HTTPS; left out: HTTP, on this machine only.
+        key: PEM file of its private key, without a password; left out: only where there is no certificate.
+        origin: how browsers reach the server through a proxy that you run in front of it, such as https://robots.example;
+            left out: they reach it directly.
     """
     from tutelage.console.serve import WebConfig
     from tutelage.console.serve import serve as run

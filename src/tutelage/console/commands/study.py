@@ -36,9 +36,10 @@ def run(
         practice: begin with the practice of appendix B.4.
         host: address to listen on; others than this machine's own need a certificate, a key and accounts.
         port: 0: any free one.
-        certificate: PEM file of the server's certificate, for HTTPS.
-        key: PEM file of its private key.
-        origin: how browsers reach the server through a proxy that you run in front of it, such as https://robots.example.
+        certificate: PEM file of the server's certificate, for HTTPS; left out: HTTP, on this machine only.
+        key: PEM file of its private key, without a password; left out: only where there is no certificate.
+        origin: how browsers reach the server through a proxy that you run in front of it, such as https://robots.example;
+            left out: they reach it directly.
     """
     from tutelage.console.serve import WebConfig, serve
 
