@@ -79,7 +79,7 @@ def issue(
     Args:
         authority: folder of the fleet's authority.
         requests: signing requests of nodes and routers; of a node's folder on this machine, the answer is put there at once.
-            without one, only the policy is signed, with --policy.
+            Without one, only the policy is signed, with --policy.
         policy: sign policy.toml as it now is: a new bundle for every member.
         hours: validity of the certificates.
     """
