@@ -37,6 +37,15 @@ def write_atomic(path: Path, content: bytes, *, private: bool = False) -> None:
         raise TutelageError(f"cannot write {path}: {error.strerror}; free some space or choose another folder") from None
 
 
+def claimed(file: int) -> bool:
+    """Whether an open file (its descriptor) is this process's now, until it is closed: False while it is another's."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
 class Lock:
     """A lock between processes and threads: whoever holds the file's lock. The thread that holds it may enter again."""
 

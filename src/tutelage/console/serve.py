@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import signal
 import socket
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from tutelage.errors import ConfigError, MissingExtraError
+from tutelage.files import claimed
 
 try:
     import uvicorn
@@ -198,8 +198,8 @@ def serve(open_supervision: Callable[[Audit], Supervision | Study], out: Path, w
             supervision.subscribe(Terminal(supervision.description.robots, say).hear)
             supervision.start()
         audit.write("server", "server", action="start", pid=os.getpid())
+        ending.server = server  # before people are told that Ctrl-C ends it
         _greet(say, site, listening, invitation)
-        ending.server = server
         server.run(sockets=[listening])
         say("stopping: robots hold, everything is written down")
         audit.write("server", "server", action="stop")
@@ -226,10 +226,9 @@ def _only_one(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise ConfigError(f"cannot use the folder {folder}: {error.strerror}") from None
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not claimed(file):
+            raise ConfigError(f"another server uses {folder}; give another --out")
         yield
-    except BlockingIOError:
-        raise ConfigError(f"another server uses {folder}; give another --out") from None
     finally:
         os.close(file)
 

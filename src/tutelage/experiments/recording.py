@@ -14,6 +14,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from tutelage.errors import MissingExtraError, RunFolderError, TutelageError
+from tutelage.files import claimed
 from tutelage.fleet.events import Events
 from tutelage.fleet.loop import Loop
 from tutelage.fleet.step import Step
@@ -366,14 +367,10 @@ def lock(folder: Path) -> TextIO:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = open(folder / ".lock", "w")  # noqa: SIM115 - held for the length of the run
+        ours = claimed(file.fileno())
     except OSError as error:
         raise RunFolderError(f"cannot write to {folder}: {error.strerror}; choose another folder") from None
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # pragma: no cover - Windows has no such lock
-        pass
-    except OSError:
-        raise RunFolderError(f"{folder} is in use by another process; wait for it or choose another folder") from None
+    if not ours:
+        file.close()
+        raise RunFolderError(f"{folder} is in use by another process; wait for it or choose another folder")
     return file

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from tutelage.errors import ConfigError
+from tutelage.files import claimed
 
 FILE = ".running"
 
@@ -38,7 +38,7 @@ def claim(folder: Path, what: str) -> Iterator[None]:
         return
     try:
         until = time.monotonic() + LEAVING
-        while not _locked(file):
+        while not claimed(file):
             if time.monotonic() < until:
                 time.sleep(0.05)
                 continue
@@ -50,11 +50,3 @@ def claim(folder: Path, what: str) -> Iterator[None]:
         yield
     finally:
         os.close(file)
-
-
-def _locked(file: int) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
