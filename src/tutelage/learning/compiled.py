@@ -15,6 +15,8 @@ from tutelage.policies.compiled import FAST, ONE, RECTIFIED, SIGMOID, TANH, ZERO
 BETA_1, BETA_2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-8)
 """Of Adam, as in PyTorch."""
 TWO = np.float32(2)
+TINY = np.finfo(np.float32).tiny
+"""The smallest number of full precision."""
 
 
 @numba.njit(nogil=True, cache=True)
@@ -174,9 +176,11 @@ def _sum_rows(x, total):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST)
 def _adam(old, new, gradient, first, second, rate, correction):  # type: ignore[no-untyped-def]
-    """Adam on n numbers."""
+    """Adam on n numbers. Moments of a parameter that has no gradient any more become 0 and not denormal, which is slow."""
     for i in range(old.shape[0]):
         g = gradient[i]
-        first[i] += (ONE - BETA_1) * (g - first[i])
-        second[i] = BETA_2 * second[i] + (ONE - BETA_2) * g * g
+        m = first[i] + (ONE - BETA_1) * (g - first[i])
+        v = BETA_2 * second[i] + (ONE - BETA_2) * g * g
+        first[i] = ZERO if abs(m) < TINY else m
+        second[i] = ZERO if v < TINY else v
         new[i] = old[i] - rate * first[i] / (np.sqrt(second[i]) * correction + EPSILON)
