@@ -67,28 +67,34 @@ class Ours:
 
 
 class RawPhysics:
-    """Exactly the physics of a stretch of a run, again and again: the engine alone, with the recorded commands."""
+    """Exactly the physics of a run, stretch by stretch: the engine alone, with the commands that a run like it just gave."""
 
-    def __init__(self, assembly: Assembly, loop: Loop, steps: int) -> None:
-        fleet = assembly.fleet
+    def __init__(self, run: Ours) -> None:
+        fleet = run.assembly.fleet
         assert isinstance(fleet, MujocoFleet)
-        self.physics, self.calls = fleet.physics, []
-        self.start = self.physics.get_state()
-        advance, restart = self.physics.advance_async, self.physics.restart
-        self.physics.advance_async = lambda *a: self._note("advance", advance, a)  # type: ignore[method-assign]
-        self.physics.restart = lambda *a: self._note("restart", restart, a)  # type: ignore[method-assign]
-        loop.run(loop.t + steps)
-        self.physics.advance_async, self.physics.restart = advance, restart  # type: ignore[method-assign]
+        self.run, self.physics = run, fleet.physics
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
+
+    def record(self) -> None:
+        """Let the run go on for a stretch, and back to its start; not part of what is timed.
+
+        How many robots stand, fall and wait changes in the course of a run, and with it what physics costs.
+        """
+        physics, start = self.physics, self.physics.get_state()
+        advance, restart = physics.advance_async, physics.restart
+        self.calls.clear()
+        physics.advance_async = lambda *a: self._note("advance", advance, a)  # type: ignore[method-assign]
+        physics.restart = lambda *a: self._note("restart", restart, a)  # type: ignore[method-assign]
+        self.run()
+        physics.advance_async, physics.restart = advance, restart  # type: ignore[method-assign]
+        physics.set_state(start)
 
     def _note(self, kind: str, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         self.calls.append((kind, copy.deepcopy(arguments)))
         return work(*arguments)
 
-    def rewind(self) -> None:
-        """Back to the start of the stretch; not part of what is timed."""
-        self.physics.set_state(self.start)
-
     def __call__(self) -> None:
+        """The same stretch again; the run goes on from its end."""
         for kind, arguments in self.calls:
             if kind == "advance":
                 self.physics.advance_async(*arguments).results()
@@ -186,8 +192,7 @@ VARIANTS = ("original", "ours", "ours, overlap", "raw physics", "raw gradients",
 def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
     """One task; every variant runs `steps` timesteps in each round."""
     lockstep, overlap = (Ours(task, steps, overlap=o) for o in (False, True))
-    floor = Ours(task, steps)
-    physics, gradients = RawPhysics(floor.assembly, floor.loop, steps), RawGradients(floor.assembly, steps)
+    physics, gradients = RawPhysics(Ours(task, steps)), RawGradients(ready(task, pretrain=PRETRAIN), steps)
     library = RawGradients(ready(task, pretrain=PRETRAIN), steps, library=True)
     data, moved = lockstep.assembly.learner.dataset, Headcount()
     original = OriginalLoop(
@@ -205,9 +210,10 @@ def measure(task: str, steps: int, rounds: int) -> dict[str, Any]:
             "raw physics": physics, "raw gradients": gradients, "raw gradients, PyTorch": library,
         }, rounds, before={
             "original": share, "raw gradients, PyTorch": share, "ours": lockstep.threads, "ours, overlap": overlap.threads,
-            "raw physics": physics.rewind,
+            "raw physics": physics.record,
         },
     )  # fmt: skip
+    assert np.array_equal(physics.run.loop.obs, lockstep.loop.obs), "the floor is that of another run"
     original.envs.close()
     floors = ("raw physics", "raw gradients")
     public = ("raw physics", "raw gradients, PyTorch")
