@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from tutelage.claims import claim
-from tutelage.policies.compiled import FAST, ONE, RECTIFIED, SIGMOID, TANH, ZERO, join, layer, normalise_row
+from tutelage.policies.compiled import ALONG, FAST, ONE, RECTIFIED, SIGMOID, TANH, ZERO, join, layer, normalise_row
 
 BETA_1, BETA_2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-8)
 """Of Adam, as in PyTorch."""
@@ -51,7 +51,7 @@ def _imitate(  # type: ignore[no-untyped-def]
     return loss
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(nogil=True, cache=True, fastmath=FAST)  # not along: few numbers, rounded as in all results so far
 def _imitation_error(said, actions, index, middle, half, delta):  # type: ignore[no-untyped-def]
     """The mean squared error of `said` (B, A), and into delta its gradient with respect to the sums before tanh."""
     loss, scale = 0.0, TWO / np.float32(said.size)
@@ -98,7 +98,7 @@ def _criticise(  # type: ignore[no-untyped-def]
     return loss
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def _critic_error(said, target, delta):  # type: ignore[no-untyped-def]
     """The mean squared error of `said` (B, 1), and into delta its gradient with respect to the sums before the sigmoid."""
     loss, scale = 0.0, TWO / np.float32(said.size)
@@ -109,7 +109,7 @@ def _critic_error(said, target, delta):  # type: ignore[no-untyped-def]
     return loss / said.size
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def _approach(slow, fast, tau):  # type: ignore[no-untyped-def]
     """slow goes tau of the way to fast, (n,) each."""
     for i in range(slow.shape[0]):
@@ -157,7 +157,7 @@ def _descend(  # type: ignore[no-untyped-def]
         stop = start
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def _mask(delta, hidden):  # type: ignore[no-untyped-def]
     """The gradient after a rectifier becomes the one before it, in place: nothing passes where it gave 0. (B, b) each."""
     for i in range(delta.shape[0]):
@@ -165,7 +165,7 @@ def _mask(delta, hidden):  # type: ignore[no-untyped-def]
             delta[i, j] = delta[i, j] if hidden[i, j] > ZERO else ZERO
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def _sum_rows(x, total):  # type: ignore[no-untyped-def]
     """(B, b) -> (b,)."""
     total[:] = ZERO
@@ -174,7 +174,7 @@ def _sum_rows(x, total):  # type: ignore[no-untyped-def]
             total[j] += x[i, j]
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def _adam(old, new, gradient, first, second, rate, correction):  # type: ignore[no-untyped-def]
     """Adam on n numbers. Moments of a parameter that has no gradient any more become 0 and not denormal, which is slow."""
     for i in range(old.shape[0]):

@@ -31,9 +31,11 @@ FEW = 16
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 """Sums may change their order, once, when they are compiled. NaN and infinity stay what they are."""
+ALONG = {"nogil": True, "cache": True, "fastmath": FAST, "error_model": "numpy"}
+"""Of loops over many numbers, which go several at a time: they could not if a division by zero had to raise an error."""
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def normalise_row(row, mean, std, x):  # type: ignore[no-untyped-def]
     """The clipped z-scores of D numbers, into x (D,)."""
     for j in range(x.shape[0]):
@@ -41,7 +43,7 @@ def normalise_row(row, mean, std, x):  # type: ignore[no-untyped-def]
         x[j] = LIMIT if z > LIMIT else -LIMIT if z < -LIMIT else z
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def layer(x, weight, bias, kind, out):  # type: ignore[no-untyped-def]
     """kind(x weight + bias), into out. x: (B, a), weight: (a, b), bias: (b,), out: (B, b)."""
     np.dot(x, weight, out)
@@ -109,7 +111,7 @@ def _member(k, start, stop, said, obs, mean, std, weights, biases):  # type: ign
     _forward(x, k, weights, biases, TANH, said[k][start:stop])
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def mean_and_variance(said, middle, half, action, variance):  # type: ignore[no-untyped-def]
     """Of what the members say (K, N, A): the mean, within a range of actions, into action (N, A), and the variance.
 
@@ -142,7 +144,7 @@ def _critic(k, start, stop, said, obs, actions, mean, std, middle, half, weights
     _forward(x, k, weights, biases, SIGMOID, said[k][start:stop])
 
 
-@numba.njit(nogil=True, cache=True, fastmath=FAST)
+@numba.njit(**ALONG)
 def join(obs, action, mean, std, middle, half, x):  # type: ignore[no-untyped-def]
     """What a critic sees: z-scores of obs (D,), and action (A,) in units of half its range, into x (D + A,)."""
     width = obs.shape[0]
