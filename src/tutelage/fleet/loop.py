@@ -115,10 +115,10 @@ class Loop:
     def step(self) -> Step:
         """One timestep of all robots."""
         self.journal.t, self.in_step = self.t, True
-        if self._prompt and self.overlap:
-            self._prompt.begin(self.t)
         self._reach()
         view = self._observe()
+        if self._prompt and self.overlap:
+            self._prompt.begin(self.t)  # only now: acting wants all cores
         waiting = self._allocate(self.priority(view))
         (actions, wanted, silent), mode, human = self._act(view), self.mode.copy(), self.human_of
         held = silent | waiting
