@@ -32,7 +32,7 @@ def imitate(counter, losses, *arguments):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def _imitate(  # type: ignore[no-untyped-def]
     k, obs, actions, index, mean, std, middle, half,
-    weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction,
+    weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction,
 ):  # fmt: skip
     """One step of tanh network k towards the human actions in its batch (eq. 5.3); returns its mean squared error before.
 
@@ -47,7 +47,7 @@ def _imitate(  # type: ignore[no-untyped-def]
         normalise_row(obs[index[k, i]], mean, std, values[0][k, i])
     _forward(k, weights, biases, values, TANH)
     loss = _imitation_error(values[-1][k], actions, index[k], middle, half, deltas[-1][k])
-    _descend(k, weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction)
+    _descend(k, weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction)
     return loss
 
 
@@ -76,7 +76,7 @@ def criticise(counter, losses, *arguments):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def _criticise(  # type: ignore[no-untyped-def]
     k, obs, actions, target, mean, std, middle, half, slow_weights, slow_biases, tau,
-    weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction,
+    weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction,
 ):  # fmt: skip
     """One step of critic k towards `target`, and of its slow copy towards it; returns its mean squared error before.
 
@@ -91,7 +91,7 @@ def _criticise(  # type: ignore[no-untyped-def]
         join(obs[i], actions[i], mean, std, middle, half, values[0][k, i])
     _forward(k, weights, biases, values, SIGMOID)
     loss = _critic_error(values[-1][k], target, deltas[-1][k])
-    _descend(k, weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction)
+    _descend(k, weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction)
     for number in range(len(weights)):
         _approach(slow_weights[number][k].ravel(), new_weights[number][k].ravel(), tau)
         _approach(slow_biases[number][k].ravel(), new_biases[number][k].ravel(), tau)
@@ -127,7 +127,7 @@ def _forward(k, weights, biases, values, kind):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def _descend(  # type: ignore[no-untyped-def]
-    k, weights, biases, new_weights, new_biases, values, deltas, gradient, first, second, rate, correction
+    k, weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction
 ):
     """Network k goes one step of Adam down the gradient that deltas[-1] begins. All arrays are float32 and contiguous.
 
@@ -136,24 +136,24 @@ def _descend(  # type: ignore[no-untyped-def]
         new_weights, new_biases: where those after the step go.
         values: (K, B, D), then (K, B, b) for each layer: what it says.
         deltas: (K, B, b) for each layer: the gradient with respect to its sums; room for all but the last.
-        gradient: (K, P): room for the gradient of each layer's weights and then its biases.
-        first, second: (K, P): Adam's moments, in the same order; changed.
+        first, second: (K, P): Adam's moments, each layer's weights and then its biases; changed.
         rate: learning rate / (1 - beta_1^t), correction: 1 / sqrt(1 - beta_2^t), at Adam's step t.
     """
-    stop = gradient.shape[1]
+    stop = first.shape[1]
     for number in range(len(weights) - 1, -1, -1):
         a, b = weights[number].shape[1:]
         start, between = stop - (a + 1) * b, stop - b
-        np.dot(values[number][k].T, deltas[number][k], gradient[k, start:between].reshape((a, b)))
-        _sum_rows(deltas[number][k], gradient[k, between:stop])
+        gradient, total = np.empty((a, b), np.float32), np.empty(b, np.float32)  # which Adam finds in the core's own cache
+        np.dot(values[number][k].T, deltas[number][k], gradient)
+        _sum_rows(deltas[number][k], total)
         if number:
             np.dot(deltas[number][k], weights[number][k].T, deltas[number - 1][k])
             _mask(deltas[number - 1][k], values[number][k])
-        for old, new, i, j in (
-            (weights[number][k].ravel(), new_weights[number][k].ravel(), start, between),
-            (biases[number][k].ravel(), new_biases[number][k].ravel(), between, stop),
+        for old, new, slope, i, j in (
+            (weights[number][k].ravel(), new_weights[number][k].ravel(), gradient.ravel(), start, between),
+            (biases[number][k].ravel(), new_biases[number][k].ravel(), total, between, stop),
         ):
-            _adam(old, new, gradient[k, i:j], first[k, i:j], second[k, i:j], rate, correction)
+            _adam(old, new, slope, first[k, i:j], second[k, i:j], rate, correction)
         stop = start
 
 

@@ -73,7 +73,7 @@ class CompiledDescent:
         self._members = len(self._new[0][0])
         self._losses = np.zeros(self._members)
         size = sum(array[0].size for arrays in self._new for array in arrays)
-        self._gradient, self._first, self._second = (np.zeros((self._members, size), np.float32) for _ in range(3))
+        self._first, self._second = (np.zeros((self._members, size), np.float32) for _ in range(2))
         self._values: Arrays = ()
         self._deltas: Arrays = ()
         self._begun = Together(1, [])
@@ -89,7 +89,7 @@ class CompiledDescent:
         rate = np.float32(self._learning_rate / (1 - 0.9**self._steps))
         correction = np.float32(1 / np.sqrt(1 - 0.999**self._steps))
         layers = *self._net.arrays(), *self._new, self._values, self._deltas
-        adam = self._gradient, self._first, self._second, rate, correction
+        adam = self._first, self._second, rate, correction
         self._begun = share(kernel, self._members, self._threads, self._losses, *data, *layers, *adam)
 
     def end(self) -> float:
