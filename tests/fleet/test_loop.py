@@ -103,9 +103,9 @@ def test_with_overlap_learning_happens_while_physics_runs() -> None:
 @pytest.mark.parametrize(
     ("overlap", "order"),
     [(False, ["policy.act", "hear", "begin", "step_async", "step_wait", "record", "update"]),
-     (True, ["begin", "policy.act", "step_async", "update", "step_wait", "record"])],
+     (True, ["policy.act", "begin", "step_async", "update", "step_wait", "record"])],
 )  # fmt: skip
-def test_a_prompt_learner_begins_as_soon_as_it_has_what_it_learns_from(overlap, order) -> None:
+def test_a_prompt_learner_begins_when_it_has_what_it_learns_from_and_acting_has_had_all_cores(overlap, order) -> None:
     class Prompt(FakeLearner):
         def hear(self, t, obs, wanted) -> None:
             self.log.append("hear")

@@ -61,7 +61,7 @@ class RunConfig:
         supervisor_noise: standard deviation of the humans' trembling, as a fraction of half the action range.
         expert: the algorithmic humans: a file of weights, or module:function that returns a policy; default: the weights
             shipped with the task.
-        overlap: learn during the whole of a timestep (the update at step t then sees the data up to t - 1).
+        overlap: learn while all else of a timestep goes on (the update at step t then sees the data up to t - 1).
         threads: threads in which physics runs, and policy and critics learn from vectors; default: one a core.
         torch_threads: threads of each matrix product of networks that see images; default: all cores, at most 4.
         out: run folder; default: runs/TASK-PRIORITY-sSEED, or runs/TASK-images-PRIORITY-sSEED.

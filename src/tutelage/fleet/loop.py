@@ -3,7 +3,7 @@
     observe -> score -> allocate -> act -> step -> reset and re-observe -> record -> learn
 
 What is learned from humans alone may be learned while robots move: what humans want is known before (`PromptLearner`). With
-`overlap`, the policy learns from the timesteps before during the whole of this one.
+`overlap`, the policy learns from the timesteps before while all of this one but acting goes on.
 
 A single robot with one human is a fleet with N = M = 1. Everything else (recording, progress, checkpoints, plots, the
 console) subscribes to the loop's steps; the loop does not know it.
@@ -47,7 +47,7 @@ class Loop:
         signals: how to compute what the priority looks at, by name; `uncertainty` is the policy's own by default.
         subscribers: listeners.
         execution: what a robot executes while a human is in control; by default what the human wants.
-        overlap: learn during the whole of a timestep. The update at step t then sees the data up to t - 1; it still changes
+        overlap: learn while all else of a timestep goes on. The update at step t then sees the data up to t - 1; it still changes
             the policy from t + 1 on.
         wait: robots that need a human stand still until one is with them, instead of going on by themselves meanwhile.
         seed: root seed.
