@@ -165,3 +165,26 @@ def test_what_goes_wrong_in_the_background_is_raised_at_the_end() -> None:
     learner.begin(data, 4)
     with pytest.raises(TypeError):
         learner.end()
+
+
+def test_moments_without_a_gradient_fade_to_zero_and_never_to_denormal_numbers() -> None:
+    from tutelage.learning.compiled import _adam
+
+    old, new, first, second = (np.full(40, value, np.float32) for value in (1.0, 0.0, 1e-3, 1e-6))
+    gradient = np.zeros(40, np.float32)
+    tiny = np.finfo(np.float32).tiny
+    for _ in range(1500):
+        _adam(old, new, gradient, first, second, np.float32(1e-3), np.float32(1.0))
+        assert not ((first != 0) & (np.abs(first) < tiny)).any()
+        old[:] = new
+    assert (first == 0).all()
+    assert (second > 0).all(), "this one fades more slowly"
+    assert np.isfinite(new).all()
+
+
+def test_a_gradient_that_is_no_number_is_not_hidden() -> None:
+    from tutelage.learning.compiled import _adam
+
+    old, new, first, second = (np.ones(3, np.float32) for _ in range(4))
+    _adam(old, new, np.array([0.0, np.nan, np.inf], np.float32), first, second, np.float32(1e-3), np.float32(1.0))
+    assert np.isnan(new).tolist() == [False, True, True]
