@@ -47,8 +47,8 @@ class Loop:
         signals: how to compute what the priority looks at, by name; `uncertainty` is the policy's own by default.
         subscribers: listeners.
         execution: what a robot executes while a human is in control; by default what the human wants.
-        overlap: learn while all else of a timestep goes on. The update at step t then sees the data up to t - 1; it still changes
-            the policy from t + 1 on.
+        overlap: learn while all else of a timestep goes on. The update at step t then sees the data up to t - 1; it still
+            changes the policy from t + 1 on.
         wait: robots that need a human stand still until one is with them, instead of going on by themselves meanwhile.
         seed: root seed.
     """
