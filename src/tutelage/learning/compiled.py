@@ -32,7 +32,7 @@ def imitate(counter, losses, *arguments):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def _imitate(  # type: ignore[no-untyped-def]
     k, obs, actions, index, mean, std, middle, half,
-    weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction,
+    weights, biases, new_weights, new_biases, first, second, rate, correction,
 ):  # fmt: skip
     """One step of tanh network k towards the human actions in its batch (eq. 5.3); returns its mean squared error before.
 
@@ -43,11 +43,14 @@ def _imitate(  # type: ignore[no-untyped-def]
         mean, std: (D,), to normalise observations; middle, half: (A,): errors are in units of half the range of actions.
         weights, and all that follows: see `_descend`.
     """
-    for i in range(index.shape[1]):
-        normalise_row(obs[index[k, i]], mean, std, values[0][k, i])
-    _forward(k, weights, biases, values, TANH)
-    loss = _imitation_error(values[-1][k], actions, index[k], middle, half, deltas[-1][k])
-    _descend(k, weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction)
+    batch, layers = index.shape[1], len(weights)
+    room = _room(batch, weights)
+    x = _rows(room, 0, batch, len(mean))
+    for i in range(batch):
+        normalise_row(obs[index[k, i]], mean, std, x[i])
+    said = _forward(k, batch, weights, biases, room, TANH)
+    loss = _imitation_error(said, actions, index[k], middle, half, _rows(room, layers + 1, batch, len(middle)))
+    _descend(k, batch, weights, biases, new_weights, new_biases, room, first, second, rate, correction)
     return loss
 
 
@@ -76,7 +79,7 @@ def criticise(counter, losses, *arguments):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def _criticise(  # type: ignore[no-untyped-def]
     k, obs, actions, target, mean, std, middle, half, slow_weights, slow_biases, tau,
-    weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction,
+    weights, biases, new_weights, new_biases, first, second, rate, correction,
 ):  # fmt: skip
     """One step of critic k towards `target`, and of its slow copy towards it; returns its mean squared error before.
 
@@ -87,12 +90,15 @@ def _criticise(  # type: ignore[no-untyped-def]
         slow_weights, slow_biases, tau: the target network, which goes tau of the way.
         weights, and all that follows: see `_descend`.
     """
-    for i in range(len(target)):
-        join(obs[i], actions[i], mean, std, middle, half, values[0][k, i])
-    _forward(k, weights, biases, values, SIGMOID)
-    loss = _critic_error(values[-1][k], target, deltas[-1][k])
-    _descend(k, weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction)
-    for number in range(len(weights)):
+    batch, layers = len(target), len(weights)
+    room = _room(batch, weights)
+    x = _rows(room, 0, batch, len(mean) + len(middle))
+    for i in range(batch):
+        join(obs[i], actions[i], mean, std, middle, half, x[i])
+    said = _forward(k, batch, weights, biases, room, SIGMOID)
+    loss = _critic_error(said, target, _rows(room, layers + 1, batch, 1))
+    _descend(k, batch, weights, biases, new_weights, new_biases, room, first, second, rate, correction)
+    for number in range(layers):
         _approach(slow_weights[number][k].ravel(), new_weights[number][k].ravel(), tau)
         _approach(slow_biases[number][k].ravel(), new_biases[number][k].ravel(), tau)
     return loss
@@ -117,25 +123,44 @@ def _approach(slow, fast, tau):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)
-def _forward(k, weights, biases, values, kind):  # type: ignore[no-untyped-def]
-    """What each layer of network k says, from values[0] on; the last is of the given kind, all others are rectified."""
-    last = len(weights) - 1
-    for number in range(last + 1):
-        now = kind if number == last else RECTIFIED
-        layer(values[number][k], weights[number][k], biases[number][k, 0], now, values[number + 1][k])
+def _room(batch, weights):  # type: ignore[no-untyped-def]
+    """For a step of a network of L layers: L + 2 rows; n is for what goes into layer n, row L for what comes out at the end.
+
+    The gradient with respect to the sums of layer n goes to row n + 2: what that held is not needed any more. The room is
+    that of the thread and not of the network, so it stays in the cache of one core.
+    """
+    width = weights[0].shape[1]
+    for number in range(len(weights)):
+        width = max(width, weights[number].shape[2])
+    return np.empty((len(weights) + 2, batch * width), np.float32)
 
 
 @numba.njit(nogil=True, cache=True)
-def _descend(  # type: ignore[no-untyped-def]
-    k, weights, biases, new_weights, new_biases, values, deltas, first, second, rate, correction
-):
-    """Network k goes one step of Adam down the gradient that deltas[-1] begins. All arrays are float32 and contiguous.
+def _rows(room, number, batch, width):  # type: ignore[no-untyped-def]
+    """A row of the room as (batch, width)."""
+    return room[number, : batch * width].reshape((batch, width))
+
+
+@numba.njit(nogil=True, cache=True)
+def _forward(k, batch, weights, biases, room, kind):  # type: ignore[no-untyped-def]
+    """What network k says of the inputs in the room: `kind` of its last sums; all others are rectified."""
+    last = len(weights) - 1
+    for number in range(last + 1):
+        a, b = weights[number].shape[1:]
+        said = _rows(room, number + 1, batch, b)
+        now = kind if number == last else RECTIFIED
+        layer(_rows(room, number, batch, a), weights[number][k], biases[number][k, 0], now, said)
+    return said
+
+
+@numba.njit(nogil=True, cache=True)
+def _descend(k, batch, weights, biases, new_weights, new_biases, room, first, second, rate, correction):  # type: ignore[no-untyped-def]
+    """Network k goes one step of Adam down the gradient that the room's last row begins. Arrays are float32 and contiguous.
 
     Args:
         weights, biases: a layer's (K, a, b) and (K, 1, b), for each layer.
         new_weights, new_biases: where those after the step go.
-        values: (K, B, D), then (K, B, b) for each layer: what it says.
-        deltas: (K, B, b) for each layer: the gradient with respect to its sums; room for all but the last.
+        room: what `_forward` left there; changed.
         first, second: (K, P): Adam's moments, each layer's weights and then its biases; changed.
         rate: learning rate / (1 - beta_1^t), correction: 1 / sqrt(1 - beta_2^t), at Adam's step t.
     """
@@ -143,12 +168,14 @@ def _descend(  # type: ignore[no-untyped-def]
     for number in range(len(weights) - 1, -1, -1):
         a, b = weights[number].shape[1:]
         start, between = stop - (a + 1) * b, stop - b
-        gradient, total = np.empty((a, b), np.float32), np.empty(b, np.float32)  # which Adam finds in the core's own cache
-        np.dot(values[number][k].T, deltas[number][k], gradient)
-        _sum_rows(deltas[number][k], total)
+        inputs, delta = _rows(room, number, batch, a), _rows(room, number + 2, batch, b)
+        gradient, total = np.empty((a, b), np.float32), np.empty(b, np.float32)
+        np.dot(inputs.T, delta, gradient)
+        _sum_rows(delta, total)
         if number:
-            np.dot(deltas[number][k], weights[number][k].T, deltas[number - 1][k])
-            _mask(deltas[number - 1][k], values[number][k])
+            before = _rows(room, number + 1, batch, a)
+            np.dot(delta, weights[number][k].T, before)
+            _mask(before, inputs)
         for old, new, slope, i, j in (
             (weights[number][k].ravel(), new_weights[number][k].ravel(), gradient.ravel(), start, between),
             (biases[number][k].ravel(), new_biases[number][k].ravel(), total, between, stop),

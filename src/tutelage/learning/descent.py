@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tutelage.cores import Together, share
 from tutelage.learning.optimiser import adam, load_optimiser_state, optimiser_state
-from tutelage.policies.mlp import Arrays, BatchedMLP
+from tutelage.policies.mlp import BatchedMLP
 from tutelage.policies.networks import Network
 
 Array = NDArray[Any]
@@ -74,23 +74,18 @@ class CompiledDescent:
         self._losses = np.zeros(self._members)
         size = sum(array[0].size for arrays in self._new for array in arrays)
         self._first, self._second = (np.zeros((self._members, size), np.float32) for _ in range(2))
-        self._values: Arrays = ()
-        self._deltas: Arrays = ()
         self._begun = Together(1, [])
 
-    def begin(self, kernel: Callable[..., None], batch: int, *data: Any) -> None:
+    def begin(self, kernel: Callable[..., None], *data: Any) -> None:
         """Start a step of every network in the background.
 
-        kernel: `imitate` or `criticise`; batch: how many pairs; data: its arguments between losses and weights.
+        kernel: `imitate` or `criticise`; data: its arguments between losses and weights.
         """
-        if not self._values or self._values[0].shape[1] != batch:
-            self._values, self._deltas = self._rooms(batch)
         self._steps += 1
         rate = np.float32(self._learning_rate / (1 - 0.9**self._steps))
         correction = np.float32(1 / np.sqrt(1 - 0.999**self._steps))
-        layers = *self._net.arrays(), *self._new, self._values, self._deltas
-        adam = self._first, self._second, rate, correction
-        self._begun = share(kernel, self._members, self._threads, self._losses, *data, *layers, *adam)
+        step = *self._net.arrays(), *self._new, self._first, self._second, rate, correction
+        self._begun = share(kernel, self._members, self._threads, self._losses, *data, *step)
 
     def end(self) -> float:
         """Wait for what began; returns the mean of the losses before it."""
@@ -99,16 +94,6 @@ class CompiledDescent:
         self._net.adopt(*self._new)
         self._new = before
         return float(sum(self._losses.tolist())) / self._members
-
-    def _rooms(self, batch: int) -> tuple[Arrays, Arrays]:
-        """Room for what the layers say of a batch, and for its gradients."""
-        weights, _ = self._new
-        inputs, *widths = weights[0].shape[1], *(weight.shape[2] for weight in weights)
-        values, deltas = (
-            tuple(np.empty((self._members, batch, width), np.float32) for width in row)
-            for row in ([inputs, *widths], widths)
-        )
-        return values, deltas
 
     def state_dict(self) -> dict[str, Any]:
         """The moments of each parameter of the K networks, by position (copies); nothing before the first step."""

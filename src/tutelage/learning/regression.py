@@ -57,7 +57,7 @@ class CompiledRegression:
 
     def begin(self, data: AggregatedDataset, batch: int) -> None:
         rows = data.obs.rows.numpy(), data.actions.rows.numpy()
-        self._descent.begin(self._imitate, batch, *rows, data.draw(batch), *self._scale)
+        self._descent.begin(self._imitate, *rows, data.draw(batch), *self._scale)
 
     def end(self) -> float:
         return self._descent.end()

@@ -78,7 +78,7 @@ class CompiledTwins:
 
     def step(self, obs: Array, actions: Array, y: Array) -> float:
         batch = [np.ascontiguousarray(x, dtype=np.float32) for x in (obs, actions, y)]
-        self.descent.begin(self._criticise, len(y), *batch, *self._scale, *self._target, self._tau)
+        self.descent.begin(self._criticise, *batch, *self._scale, *self._target, self._tau)
         return self.descent.end()
 
 
