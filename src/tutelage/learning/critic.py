@@ -169,8 +169,10 @@ class Critic:
     def add(self, obs: Array, action: Array, next_obs: Array, event: Array, end: Array) -> None:
         """Take in n transitions. event: (n,) bool, it happened in this step; end: (n,) bool, nothing can follow."""
         rows = self.plain.pack(obs, action, next_obs, end)
-        self.events.add(rows[event])
-        self.plain.add(rows[~event])
+        if event.any():
+            self.events.add(rows[event])
+            rows = rows[~event]
+        self.plain.add(rows)
 
     def update(self) -> float:
         """One gradient step; returns the loss (NaN when there are no transitions yet)."""

@@ -115,7 +115,7 @@ class ImitationLearner:
             self._add(step.obs[step.taught], step.wanted[step.taught])
         self._episode_ended = bool((step.truncated | step.success | step.violation)[step.moved].any())
         if self.critics:
-            moved = step.moved
+            moved = slice(None) if step.moved.all() else step.moved  # of large observations, every copy counts
             obs, action, after = step.obs[moved], step.actions[moved], step.next_obs[moved]
             violation, success = step.violation[moved], step.success[moved]
             for name, critic in self.critics.items():
