@@ -12,9 +12,9 @@ from sgc.fleets import service, topic
 from sgc.proxies.ros_ends import ADD, RELIABLE, AddClient, AddServer, RosNode, cdr, until
 
 from tutelage.sgc.proxies import dds_raw
+from tutelage.sgc.proxies.dds_services import _split, _with_identity
 from tutelage.sgc.proxies.ros2 import Ros2Proxy
 from tutelage.sgc.proxies.ros_names import service_channels
-from tutelage.sgc.proxies.ros_services import _split, _with_identity
 from tutelage.sgc.proxies.ros_types import RosTypes
 from tutelage.sgc.proxies.ros_values import Codec
 from tutelage.sgc.proxies.routes import Routes, ServiceRoute, parse_routes
