@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
-import os
 import threading
 import time
 from collections import defaultdict
 from multiprocessing.managers import BaseManager
 from typing import Any
-
-DOMAINS = [*range(80, 102), *range(215, 232)]
-"""Those whose ports no program is given by chance, from 80 on; Cyclone DDS ends among themselves have the others."""
 
 
 class _Node:
@@ -33,8 +28,9 @@ class _Node:
         self._executor.add_node(self._node)
         threading.Thread(target=self._executor.spin, daemon=True).start()
 
-    def subscribe(self, name: str, kind: Any, qos: Any = 400) -> None:
-        self._subscriptions.append(self._node.create_subscription(kind, name, self._heard[name].append, qos))
+    def subscribe(self, name: str, kind: Any, **qos: Any) -> None:
+        """qos: policies of `QoSProfile`, as text where they are enumerations."""
+        self._subscriptions.append(self._node.create_subscription(kind, name, self._heard[name].append, _qos(**qos)))
 
     def heard(self, name: str, count: int = 0, timeout: float = 20.0) -> list[Any]:
         """What has come, once it is as many, or time is over."""
@@ -43,8 +39,8 @@ class _Node:
             time.sleep(0.01)
         return list(self._heard[name])
 
-    def advertise(self, name: str, kind: Any, qos: Any = 400) -> None:
-        self._publishers[name] = self._node.create_publisher(kind, name, qos)
+    def advertise(self, name: str, kind: Any, **qos: Any) -> None:
+        self._publishers[name] = self._node.create_publisher(kind, name, _qos(**qos))
 
     def publish(self, name: str, messages: list[Any]) -> None:
         for message in messages:
@@ -80,21 +76,21 @@ class _Node:
             self._node.declare_parameter(name, value)
         return self._node.get_parameter(name).value
 
-    def serve(self, name: str, kind: Any, field: str, delay: float = 0.0) -> None:
-        """Reply with the request's fields of the same name, and count in `asked`; `delay`: seconds to think."""
+    def serve(self, name: str, kind: Any, delay: float = 0.0, **answer: Any) -> None:
+        """Reply with these fields, and the request's of the same name, after some seconds; see `asked`."""
         from rclpy.callback_groups import ReentrantCallbackGroup
 
-        def answer(request: Any, response: Any) -> Any:
+        def reply(request: Any, response: Any) -> Any:
             self._asked[name].append(request)
             time.sleep(delay)
-            for each in response.get_fields_and_field_types():
-                if each in request.get_fields_and_field_types():
-                    setattr(response, each, getattr(request, each))
-            if field:
-                setattr(response, field, f"from {self._node.get_name()}: {request.data}")
+            for field in request.get_fields_and_field_types():
+                if field in response.get_fields_and_field_types():
+                    setattr(response, field, getattr(request, field))
+            for field, value in answer.items():
+                setattr(response, field, value)
             return response
 
-        self._node.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
+        self._node.create_service(kind, name, reply, callback_group=ReentrantCallbackGroup())
 
     def asked(self, name: str) -> list[Any]:
         return list(self._asked[name])
@@ -135,9 +131,15 @@ class _Node:
             cancel_callback=lambda goal: CancelResponse.ACCEPT,
         )
 
-    def fibonacci(self, name: str, order: int, cancel_after: int = 0) -> tuple[int, list[int], list[int]]:
-        """Status, result and lengths of the feedback of a goal; cancelled after so many messages of feedback, 0: never."""
+    def use_fibonacci(self, name: str) -> None:
+        """Become an action client."""
         from rclpy.action import ActionClient
+        from test_msgs.action import Fibonacci
+
+        self._fibonacci = ActionClient(self._node, Fibonacci, name)
+
+    def fibonacci(self, order: int, cancel_after: int = 0) -> tuple[int, list[int], list[int]]:
+        """Status, result and lengths of the feedback of a goal; cancelled after so many messages of feedback, 0: never."""
         from test_msgs.action import Fibonacci
 
         lengths: list[int] = []
@@ -154,9 +156,8 @@ class _Node:
             assert done.wait(20.0), "no reply"
             return future.result()
 
-        client = ActionClient(self._node, Fibonacci, name)
-        assert client.wait_for_server(20.0), "no server"
-        goal = wait(client.send_goal_async(Fibonacci.Goal(order=order), feedback_callback=on_feedback))
+        assert self._fibonacci.wait_for_server(20.0), "no server"
+        goal = wait(self._fibonacci.send_goal_async(Fibonacci.Goal(order=order), feedback_callback=on_feedback))
         assert goal.accepted
         result = goal.get_result_async()
         if cancel_after:
@@ -164,6 +165,12 @@ class _Node:
             assert len(wait(goal.cancel_goal_async()).goals_canceling) == 1
         answer = wait(result)
         return int(answer.status), list(answer.result.sequence), lengths
+
+
+def _qos(depth: int = 400, reliability: str = "RELIABLE", durability: str = "VOLATILE") -> Any:
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy[reliability], durability=DurabilityPolicy[durability])
 
 
 class _Process(BaseManager):
@@ -188,9 +195,3 @@ class RosNodes:
     def close(self) -> None:
         for process in self._processes:
             process.shutdown()
-
-
-def ros_domains() -> itertools.cycle[int]:
-    """Domains in an order of this process's own, so that runs at the same time hardly meet."""
-    start = os.getpid() % len(DOMAINS)
-    return itertools.cycle(DOMAINS[start:] + DOMAINS[:start])
