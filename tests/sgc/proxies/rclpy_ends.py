@@ -95,12 +95,12 @@ class _Node:
     def asked(self, name: str) -> list[Any]:
         return list(self._asked[name])
 
-    def call(self, name: str, kind: Any, request: Any, timeout: float = 10.0) -> Any:
-        """The reply; None if there is no server, or it does not answer in time."""
+    def call(self, name: str, kind: Any, request: Any, timeout: float = 10.0, *, insist: bool = False) -> Any:
+        """The reply; None if there is no server, or it does not answer in time. insist: ask though no server is seen."""
         if name not in self._clients:
             self._clients[name] = self._node.create_client(kind, name)
         client = self._clients[name]
-        if not client.wait_for_service(timeout):
+        if not insist and not client.wait_for_service(timeout):
             return None
         return client.call(request, timeout)
 

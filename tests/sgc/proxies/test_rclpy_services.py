@@ -171,6 +171,30 @@ def test_one_end_may_be_cyclone_dds_and_the_other_rclpy(company, ros_domains, ro
             assert call.result() == SetBool.Response(success=True, message="from Cyclone DDS")
 
 
+def test_without_rclpy_in_between_a_service_of_fast_dds_is_refused_and_nobody_gets_nonsense(
+    company, ros_domains, ros_nodes, caplog
+):
+    """Cyclone DDS and Fast DDS find each other's services, but do not understand them."""
+    here, there = next(ros_domains), next(ros_domains)
+    robot, server, console = company(SERVED, "robot", "server", "console")
+    a, b = ros_nodes(here, "a"), ros_nodes(there, "b")
+    a.serve("/echo", BasicTypes)
+    dds = {"type_name": ECHO, "name": "/echo", "through": "dds"}
+    request = BasicTypes.Request(string_value="long enough to be read as something else")
+    with Ros2Proxy(robot, route(here, out=True, **dds)) as out, Ros2Proxy(server, route(there, out=False, **dds)) as into:
+        with pytest.raises(RequestFailed, match='say through = "rclpy" for the service'):
+            console.request("add", serialize_message(request), timeout=10.0)
+        assert b.call("/echo", BasicTypes, request, 0.5) is None
+        (part,) = into._parts
+        assert until(lambda: part._end._reader.matched)
+        assert b.call("/echo", BasicTypes, request, 0.5, insist=True) is None
+        assert until(lambda: counts(into)["malformed"] > 0)
+        assert counts(into)["requests"] == 0
+        assert counts(out)["no_reply"] == 1
+        assert a.asked("/echo") == []
+        assert 'say through = "rclpy" for the service' in caplog.text
+
+
 def test_two_proxies_of_one_domain_do_not_ask_each_other(company, ros_domains, ros_nodes):
     """One brings the service to the domain, the other would take it from there: each request would go round for ever."""
     here = next(ros_domains)

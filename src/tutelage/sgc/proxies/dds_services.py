@@ -16,7 +16,7 @@ import time
 import uuid
 from collections.abc import Callable
 
-from tutelage.sgc.proxies.dds_domain import Domain
+from tutelage.sgc.proxies.dds_domain import OTHER_MIDDLEWARE, Domain
 from tutelage.sgc.proxies.dds_raw import HEADER
 from tutelage.sgc.proxies.ros_names import service_channels
 from tutelage.sgc.proxies.ros_services import Request
@@ -48,12 +48,17 @@ class DdsOffered:
     """A service that is offered on a domain; see `ros_services.Offered`."""
 
     def __init__(self, domain: Domain, route: ServiceRoute, put: Callable[[Request], None]) -> None:
-        self.malformed = 0
+        self._malformed = 0
         self._put = put
         requests, replies = service_channels(route.name, route.type)
         ids = _service_id("serviceid")
         self._writer = domain.writer(replies, route.qos, ids)
-        self._reader = domain.reader(requests, route.qos, self._on_request, pairs=ids)
+        self._reader = domain.reader(requests, route.qos, self._on_request, pairs=ids, cyclone_only=True)
+
+    @property
+    def malformed(self) -> int:
+        """See `Offered.malformed`."""
+        return self._malformed + self._reader.foreign
 
     @property
     def incompatible(self) -> tuple[int, str]:
@@ -67,7 +72,7 @@ class DdsOffered:
     def _on_request(self, sample: bytes) -> None:
         parts = _split(sample)
         if parts is None:
-            self.malformed += 1
+            self._malformed += 1
         else:
             self._put(Request(*parts))
 
@@ -76,7 +81,7 @@ class DdsUsed:
     """A service of a domain, used as a client; see `ros_services.Used`."""
 
     def __init__(self, domain: Domain, route: ServiceRoute) -> None:
-        self.malformed = 0
+        self._malformed = 0
         self._route = route
         self._client = secrets.randbits(63)
         self._sequence = 0
@@ -84,8 +89,13 @@ class DdsUsed:
         self._lock = threading.Lock()
         requests, replies = service_channels(route.name, route.type)
         ids = _service_id("clientid")
-        self._reader = domain.reader(replies, route.qos, self._on_reply, pairs=ids)
+        self._reader = domain.reader(replies, route.qos, self._on_reply, pairs=ids, cyclone_only=True)
         self._writer = domain.writer(requests, route.qos, ids)
+
+    @property
+    def malformed(self) -> int:
+        """See `Used.malformed`."""
+        return self._malformed + self._reader.foreign
 
     @property
     def incompatible(self) -> tuple[int, str]:
@@ -117,11 +127,13 @@ class DdsUsed:
             if time.monotonic() > until:
                 raise TimeoutError(f"there is no ROS 2 server of {self._route.name} on domain {self._route.domain}")
             time.sleep(_MATCH_POLL)
+        if self._writer.foreign:  # it would take the identity for the beginning of the request
+            raise ConnectionRefusedError(f"{self._route.name}: {OTHER_MIDDLEWARE}")
 
     def _on_reply(self, sample: bytes) -> None:
         parts = _split(sample)
         if parts is None:
-            self.malformed += 1
+            self._malformed += 1
             return
         with self._lock:
             waiting = self._waiting.get(parts[0])  # None: another client's, or too late
