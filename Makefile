@@ -32,7 +32,7 @@ robosuite: ## tests of the extra robosuite
 ros2: ## tests of the ROS 2 proxy with real ROS 2 nodes
 	$(PYTHON) -m venv .venv-ros2
 	.venv-ros2/bin/pip install -q --disable-pip-version-check --no-deps -r constraints-ros2.txt -e .
-	.venv-ros2/bin/pytest --confcutdir=tests/sgc tests/sgc/proxies/test_rclpy.py tests/sgc/proxies/test_rclpy_services.py
+	.venv-ros2/bin/pytest --confcutdir=tests/sgc tests/sgc/proxies/test_rclpy*.py
 
 lint: $(INSTALLED) ## ruff, mypy, import contracts
 	$(BIN)/ruff check .
