@@ -170,6 +170,7 @@ def test_ros_2_sees_type_hash_and_quality_of_what_a_proxy_publishes(company, ros
         assert (seen["type"], seen["hash"]) == (own["type"], own["hash"])
         assert (seen["reliability"], seen["durability"]) == ("reliable", "transient_local")
         assert seen["node"] == "_CREATED_BY_BARE_DDS_APP_", "it is of no node"
+    assert until(lambda: not node.publishers("/from_fleet"), 20.0), "the lease is over"
 
 
 def test_what_is_on_a_domain_can_be_listed(ros_domains, ros_nodes, capsys):

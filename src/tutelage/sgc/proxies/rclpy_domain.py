@@ -94,7 +94,7 @@ class RclpyDomain:
         self._context.try_shutdown()
 
     def _run(self) -> None:
-        while not self._closed.is_set():
+        while self._context.ok() and not self._closed.is_set():
             try:
                 self._executor.spin()
             except Exception:  # one service's trouble is not the others'

@@ -87,7 +87,10 @@ class RclpyUsed(_RclpyEnd):
         parsed = self._parsed(request, self._type.Request)
         self._wait_for_server(until)
         answered = threading.Event()
-        future = self._client.call_async(parsed)
+        try:
+            future = self._client.call_async(parsed)
+        except Exception as error:  # such as: the node is closed
+            raise OSError(f"rclpy could not ask {route.name}: {error}") from None
         future.add_done_callback(lambda _: answered.set())
         if not answered.wait(max(0.0, until - time.monotonic())):
             self._client.remove_pending_request(future)
@@ -106,11 +109,14 @@ class RclpyUsed(_RclpyEnd):
 
 
 def _rclpy_qos(profile: QosProfile) -> Any:
+    from rclpy.duration import Duration
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+    promises = {"lifespan": profile.lifespan, "deadline": profile.deadline}
     return QoSProfile(
         reliability=ReliabilityPolicy[profile.reliability.upper()],
         durability=DurabilityPolicy[profile.durability.upper()],
         history=HistoryPolicy[profile.history.upper()],
         depth=profile.depth,
+        **{name: Duration(seconds=seconds) for name, seconds in promises.items() if seconds is not None},
     )
