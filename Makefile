@@ -6,10 +6,10 @@ INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
 DEMO := runs/demo
 
-.PHONY: demo test robosuite lint docs examples results bench clean help
+.PHONY: demo test robosuite ros2 lint docs examples results bench clean help
 
 help: ## this list
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
 demo: $(INSTALLED) ## 100 robots, 10 humans: C.U.R. against behaviour cloning, same seed
 	rm -rf $(DEMO)
@@ -26,6 +26,13 @@ robosuite: ## tests of the extra robosuite
 	.venv-robosuite/bin/pip install -q --disable-pip-version-check "$$(grep ^torch== constraints-robosuite.txt)"
 	.venv-robosuite/bin/pip install -q --disable-pip-version-check -c constraints-robosuite.txt -e '.[robosuite]' pytest hypothesis
 	.venv-robosuite/bin/pytest tests/envs/test_robosuite_fleet.py
+
+# ROS 2 Jazzy from PyPI, as wheels for Linux and Python 3.11 to 3.13. Connectivity stands on its own, so no PyTorch; all that is
+# installed is listed.
+ros2: ## tests of the ROS 2 proxy with real ROS 2 nodes
+	$(PYTHON) -m venv .venv-ros2
+	.venv-ros2/bin/pip install -q --disable-pip-version-check --no-deps -r constraints-ros2.txt -e .
+	.venv-ros2/bin/pytest --confcutdir=tests/sgc tests/sgc/proxies/test_rclpy*.py
 
 lint: $(INSTALLED) ## ruff, mypy, import contracts
 	$(BIN)/ruff check .
@@ -48,7 +55,7 @@ bench: $(INSTALLED) ## the speed claims, as ratios on this machine
 	$(BIN)/python -m benchmarks
 
 clean: ## remove the environment and the demo's runs
-	rm -rf $(VENV) .venv-robosuite $(DEMO) site
+	rm -rf $(VENV) .venv-robosuite .venv-ros2 $(DEMO) site
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

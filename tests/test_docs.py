@@ -176,10 +176,10 @@ def test_files_and_modules_in_code_spans_exist(page: Path) -> None:
 
 
 def test_make_targets_in_the_pages_exist() -> None:
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z0-9]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        asked = set(re.findall(r"^make ([a-z]+)", text, re.MULTILINE)) | set(re.findall(r"`make ([a-z]+)`", text))
+        asked = set(re.findall(r"^make ([a-z0-9]+)", text, re.MULTILINE)) | set(re.findall(r"`make ([a-z0-9]+)`", text))
         assert asked <= targets, name(page)
 
 

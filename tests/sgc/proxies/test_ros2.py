@@ -26,6 +26,7 @@ from tutelage.sgc.proxies import dds_raw
 from tutelage.sgc.proxies.dds_qos import parse_user_data
 from tutelage.sgc.proxies.ros2 import Ros2Proxy
 from tutelage.sgc.proxies.ros_qos import PROFILES
+from tutelage.sgc.proxies.ros_topics import Inward, Outward
 from tutelage.sgc.proxies.routes import Routes, TopicRoute
 
 CHAT = topic("chat", ["robot", "server"], ["robot", "server"])
@@ -44,6 +45,14 @@ def proxy(node, *routes, distribution=""):
 
 def counts(proxy, alias="chat"):
     return proxy.counters()["topics"][alias]
+
+
+def joined(*proxies):
+    """Has each topic of these proxies found one end of a node on its domain?"""
+    parts = [part for proxy in proxies for part in proxy._parts]
+    ends = [part._writer for part in parts if isinstance(part, Inward)]
+    ends += [part._reader for part in parts if isinstance(part, Outward)]
+    return until(lambda: all(end.matched == 1 for end in ends), 20.0)
 
 
 def test_300_messages_cross_in_order_and_each_once(company, domains):

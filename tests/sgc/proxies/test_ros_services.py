@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -11,10 +12,11 @@ from cyclonedds.sub import DataReader
 from sgc.fleets import service, topic
 from sgc.proxies.ros_ends import ADD, RELIABLE, AddClient, AddServer, RosNode, cdr, until
 
+from tutelage.errors import ConfigError
 from tutelage.sgc.proxies import dds_raw
+from tutelage.sgc.proxies.dds_services import _split, _with_identity
 from tutelage.sgc.proxies.ros2 import Ros2Proxy
 from tutelage.sgc.proxies.ros_names import service_channels
-from tutelage.sgc.proxies.ros_services import _split, _with_identity
 from tutelage.sgc.proxies.ros_types import RosTypes
 from tutelage.sgc.proxies.ros_values import Codec
 from tutelage.sgc.proxies.routes import Routes, ServiceRoute, parse_routes
@@ -93,6 +95,16 @@ def test_a_slow_server_is_given_up_and_its_late_reply_ignored(company, domains):
             console.request("add", message, timeout=3.0)
         time.sleep(0.5)
     adder.close()
+
+
+def test_without_rclpy_a_service_that_goes_through_it_is_one_line(company, domains, monkeypatch):
+    robot, _, _ = company(ADDING, "robot", "server", "console")
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    through = ServiceRoute("add", "/add", ADD, True, domain=next(domains), through="rclpy")
+    with pytest.raises(
+        ConfigError, match=r"rclpy cannot be imported .*; run: source /opt/ros/<distribution>/setup.bash, or pip"
+    ):
+        Ros2Proxy(robot, Routes((), (through,)))
 
 
 @pytest.mark.parametrize("payload", [b"", b"x", b"\0\1\0\0", b"\xff" * 50])

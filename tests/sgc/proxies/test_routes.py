@@ -73,6 +73,10 @@ def test_an_action_is_three_services_and_two_topics(robot):
         ("fold-status", "action_msgs/msg/GoalStatusArray", PROFILES["action_status"]),
     ]
     assert {route.domain for route in (*made.services, *made.topics)} == {2}
+    assert {service.through for service in made.services} == {"dds"}
+    through = routes(robot, action=[{**entry, "through": "rclpy"}])
+    assert {service.through for service in through.services} == {"rclpy"}
+    assert through.topics == made.topics
 
 
 def test_several_topics_of_the_fleet_may_meet_on_one_name(robot):
@@ -102,6 +106,7 @@ def test_all_of_a_nodes_topics_and_services_without_a_file_but_for_those_that_ro
         ({"service": [{"alias": "chat", "direction": "in"}]}, "service chat is no service"),
         ({"service": [{"alias": "grasp"}]}, "service grasp needs direction"),
         ({"service": [{"alias": "grasp", "direction": "in"}]}, "does not let robot request"),
+        ({"service": [{"alias": "grasp", "direction": "out", "through": "ros"}]}, "service grasp: through is dds or rclpy"),
         ({"topic": [{"alias": "camera", "direction": "in"}]}, "does not let robot subscribe to it"),
         ({"topic": [{"alias": "camera", "direction": "up"}]}, "direction is out, in or both"),
         ({"topic": [{"alias": "camera", "name": "no name"}]}, "topic camera: 'no name' is not a ROS 2 name"),

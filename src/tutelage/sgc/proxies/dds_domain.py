@@ -10,6 +10,7 @@ import logging
 import threading
 import uuid
 from collections.abc import Callable
+from enum import Enum, auto
 from typing import Any
 
 from tutelage.errors import ConfigError, MissingExtraError
@@ -21,6 +22,8 @@ from tutelage.sgc.proxies.ros_qos import QosProfile
 log = logging.getLogger(__name__)
 _NO_TIME = 2**63 - 1  # DDS's infinity, nanoseconds
 _AT_ONCE = 16
+_CYCLONE = b"\x01\x10"
+"""Vendor, the first bytes of the identity (GUID) of whatever Cyclone DDS has made."""
 
 
 class Reader:
@@ -28,16 +31,26 @@ class Reader:
 
     Attributes:
         ignored: samples that were left where they were, as a proxy had written them.
+        foreign: samples of another vendor's that were left, with `cyclone_only`.
     """
 
-    def __init__(self, domain: Domain, channel: Channel, qos: QosProfile, pairs: dict[str, str], deliver: _Deliver) -> None:
+    def __init__(
+        self,
+        domain: Domain,
+        channel: Channel,
+        qos: QosProfile,
+        pairs: dict[str, str],
+        deliver: _Deliver,
+        cyclone_only: bool,
+    ) -> None:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
 
         self.channel = channel
-        self.ignored = 0
+        self.ignored = self.foreign = 0
         self._deliver = deliver
-        self._proxies: dict[int, bool] = {}
+        self._cyclone_only = cyclone_only
+        self._writers: dict[int, _Origin] = {}
         self.dds = DataReader(domain.participant, domain.topic(channel), qos=dds_qos(qos, pairs, writes=False))
         self._condition = ReadCondition(self.dds, ViewState.Any | SampleState.Any | InstanceState.Any)
         self._waitset: Any = None
@@ -56,8 +69,11 @@ class Reader:
         while room := self._deliver.room():
             samples = dds_raw.take(self.dds, min(room, _AT_ONCE))
             for sample in samples:
-                if self._from_proxy(sample.writer):
+                origin = self._origin(sample.writer)
+                if origin is _Origin.PROXY:
                     self.ignored += 1
+                elif origin is _Origin.FOREIGN:
+                    self.foreign += 1
                 else:
                     self._deliver.put(sample.data)
             if not samples:
@@ -79,26 +95,44 @@ class Reader:
         """Is there room for more?"""
         return self._deliver.room() > 0
 
-    def _from_proxy(self, writer: int) -> bool:
-        known = self._proxies.get(writer)
+    def _origin(self, writer: int) -> _Origin:
+        known = self._writers.get(writer)
         if known is None:
-            known = self._proxies[writer] = bool(self._mark_of(writer))
-            if known:
-                log.warning(
-                    "another proxy writes %s here; if it brings the same, everything comes twice", self.channel.topic
-                )
-            if len(self._proxies) > 10_000:  # writers come and go for months
-                self._proxies = {writer: known}
+            known = self._writers[writer] = self._look_at(writer)
+            if len(self._writers) > 10_000:  # writers come and go for months
+                self._writers = {writer: known}
         return known
 
-    def _mark_of(self, writer: int) -> str:
+    def _look_at(self, writer: int) -> _Origin:
         from cyclonedds.core import DDSException
 
         try:
             found = self.dds.get_matched_publication_data(writer)
         except DDSException:  # it has left already; it is taken for an application
-            return ""
-        return mark_of(found.qos) if found is not None else ""
+            return _Origin.APPLICATION
+        if found is not None and mark_of(found.qos):
+            log.warning("another proxy writes %s here; if it brings the same, everything comes twice", self.channel.topic)
+            return _Origin.PROXY
+        if found is not None and self._cyclone_only and not _is_cyclone(found):
+            log.warning("%s: %s", self.channel.topic, OTHER_MIDDLEWARE)
+            return _Origin.FOREIGN
+        return _Origin.APPLICATION
+
+
+class _Origin(Enum):
+    APPLICATION = auto()
+    PROXY = auto()
+    FOREIGN = auto()
+
+
+OTHER_MIDDLEWARE = (
+    "a node uses another middleware than rmw_cyclonedds, whose services differ; "
+    'say through = "rclpy" for the service in the file of routes'
+)
+
+
+def _is_cyclone(endpoint: Any) -> bool:
+    return bool(endpoint.key.bytes[:2] == _CYCLONE)
 
 
 class _Deliver:
@@ -132,6 +166,20 @@ class Writer:
     def matched(self) -> int:
         """How many readers there are."""
         return len(self.dds.get_matched_subscriptions())
+
+    @property
+    def foreign(self) -> bool:
+        """Is there a reader of another vendor than Cyclone DDS?"""
+        from cyclonedds.core import DDSException
+
+        for reader in self.dds.get_matched_subscriptions():
+            try:
+                found = self.dds.get_matched_subscription_data(reader)
+            except DDSException:  # it has left already
+                continue
+            if found is not None and not _is_cyclone(found):
+                return True
+        return False
 
 
 class Domain:
@@ -182,13 +230,15 @@ class Domain:
         *,
         room: Callable[[], int] = lambda: _AT_ONCE,
         pairs: dict[str, str] | None = None,
+        cyclone_only: bool = False,
     ) -> Reader:
         """Read a topic: `put` gets each sample that no proxy has written, on the domain's thread, so it must not block.
 
         room: for how many samples there is room; others stay with DDS. `wake` tells that there is room again.
         pairs: for USER_DATA.
+        cyclone_only: leave samples of other vendors, which have another form, as those of services.
         """
-        reader = Reader(self, channel, qos, pairs or {}, _Deliver(put, room))
+        reader = Reader(self, channel, qos, pairs or {}, _Deliver(put, room), cyclone_only)
         with self._lock:
             self._readers.append(reader)
         self.wake()

@@ -10,14 +10,18 @@ from __future__ import annotations
 
 import logging
 import threading
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from tutelage.errors import TutelageError
 from tutelage.sgc.proxies.dds_domain import Domain
+from tutelage.sgc.proxies.dds_services import DdsOffered, DdsUsed
+from tutelage.sgc.proxies.rclpy_domain import RclpyDomain
+from tutelage.sgc.proxies.rclpy_services import RclpyOffered, RclpyUsed
 from tutelage.sgc.proxies.ros_hash import TypeHashes
 from tutelage.sgc.proxies.ros_services import Client, Server
 from tutelage.sgc.proxies.ros_topics import Inward, Outward
-from tutelage.sgc.proxies.routes import Routes
+from tutelage.sgc.proxies.routes import Routes, ServiceRoute
 
 if TYPE_CHECKING:
     from tutelage.sgc.node import Node
@@ -34,13 +38,14 @@ class Ros2Proxy:
 
     Raises:
         MissingExtraError: cyclonedds is not installed, or rosbags where the routes name a distribution.
-        ConfigError: Cyclone DDS refuses a topic.
+        ConfigError: Cyclone DDS refuses a topic; a service goes through rclpy, and rclpy or its type is not installed.
         NotAllowed: the policy does not allow a route.
     """
 
     def __init__(self, node: Node, routes: Routes) -> None:
         self._node = node
         self._domains: dict[int, Domain] = {}
+        self._rclpy_domains: dict[int, RclpyDomain] = {}
         self._closed = threading.Event()
         self._parts: list[Outward | Inward | Client | Server] = []
         hashes = TypeHashes(routes.distribution)
@@ -52,8 +57,7 @@ class Ros2Proxy:
                     others = [i for i in inward if i.route.alias == route.alias and i.route.domain != route.domain]
                     self._add(Outward(node, self._domain(route.domain), route, hashes, [other.write for other in others]))
             for service in routes.services:
-                kind = Server if service.outward else Client
-                self._add(kind(node, self._domain(service.domain), service))
+                self._add(self._service(service))
             threading.Thread(target=self._tend, name="ros2-tend", daemon=True).start()
         except BaseException:
             self.close()
@@ -75,8 +79,11 @@ class Ros2Proxy:
             part.close()
         for domain in self._domains.values():
             domain.close()
+        for rclpy in self._rclpy_domains.values():
+            rclpy.close()
         self._parts.clear()
         self._domains.clear()
+        self._rclpy_domains.clear()
 
     def __enter__(self) -> Ros2Proxy:
         return self
@@ -120,6 +127,23 @@ class Ros2Proxy:
         if number not in self._domains:
             self._domains[number] = Domain(number)
         return self._domains[number]
+
+    def _rclpy_domain(self, number: int) -> RclpyDomain:
+        if number not in self._rclpy_domains:
+            self._rclpy_domains[number] = RclpyDomain(number)
+        return self._rclpy_domains[number]
+
+    def _service(self, route: ServiceRoute) -> Client | Server:
+        node, number = self._node, route.domain
+        if route.through == "rclpy":
+            rclpy = self._rclpy_domain(number)
+            if route.outward:
+                return Server(node, RclpyUsed(rclpy, route), route)
+            return Client(node, partial(RclpyOffered, rclpy, route), route)
+        dds = self._domain(number)
+        if route.outward:
+            return Server(node, DdsUsed(dds, route), route)
+        return Client(node, partial(DdsOffered, dds, route), route)
 
     def _add(self, part: Any) -> Any:
         self._parts.append(part)

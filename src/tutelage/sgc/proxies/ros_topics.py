@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tutelage.sgc.errors import NoKey
 from tutelage.sgc.proxies import dds_raw
@@ -54,7 +54,7 @@ class Outward:
         self._thread.start()
         channel = topic_channel(route.name, route.type)
         # A writer that keeps all waits for its readers; so with KEEP_ALL samples stay with DDS while the queue is full.
-        room = {"room": lambda: self._queue.room} if self._keep_all else {}
+        room: dict[str, Any] = {"room": lambda: self._queue.room} if self._keep_all else {}
         qos = replace(route.qos, depth=max(route.qos.depth, route.queue))
         self._reader = domain.reader(channel, qos, self._queue.put, pairs=hashes.pairs(route.type), **room)
 

@@ -16,11 +16,13 @@ queue = 64                        # messages that wait each way; default: 64, on
 alias = "grasp"
 direction = "in"                  # out: the server is here; in: the clients are here
 timeout = 5.0                     # seconds
+through = "rclpy"                 # ROS 2: dds, the default, for rmw_cyclonedds; rclpy for every middleware, needs ROS 2 here
 
 [[action]]                        # its parts: fold-send_goal, -cancel_goal, -get_result, -feedback, -status
 alias = "fold"
 name = "/fold"
 type = "example_interfaces/action/Fibonacci"
+through = "rclpy"                 # its services; its topics always go through DDS
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from tutelage.errors import ConfigError
 from tutelage.sgc.access import Access, Delivery, Kind, Lane
@@ -42,6 +44,7 @@ log = logging.getLogger(__name__)
 MAX_DOMAIN = 232
 """The highest DDS domain for which there are UDP ports."""
 MAX_QUEUE = 100_000
+Through = Literal["dds", "rclpy"]
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class ServiceRoute:
         alias, name, type, qos, domain: see `TopicRoute`.
         outward: the server is here; otherwise the clients are.
         timeout: seconds after which a request is given up.
+        through: dds: as rmw_cyclonedds has services; rclpy: as the middleware of the ROS 2 installed here has them.
     """
 
     alias: str
@@ -84,6 +88,7 @@ class ServiceRoute:
     timeout: float = 5.0
     qos: QosProfile = PROFILES["services_default"]
     domain: int = 0
+    through: Through = "dds"
 
 
 @dataclass(frozen=True)
@@ -205,9 +210,17 @@ def _service(table: Table, access: Access) -> ServiceRoute:
         timeout=table.number("timeout", 5.0, 0.01, 86_400, (int, float)),
         qos=table.qos("services_default"),
         domain=table.number("domain", 0, 0, MAX_DOMAIN),
+        through=_through(table),
     )
     table.finish()
     return route
+
+
+def _through(table: Table) -> Any:
+    through = table.take("through", str, "dds")
+    if through not in get_args(Through):
+        raise ConfigError(f"{table.what}: through is {' or '.join(get_args(Through))}, not {through!r}")
+    return through
 
 
 def _name(table: Table, default: str) -> str:
@@ -233,6 +246,7 @@ def _action(table: Table, access: Access) -> tuple[list[TopicRoute], list[Servic
     direction = table.take("direction", str)
     domain = table.take("domain", int, 0)
     timeout = table.take("timeout", (int, float), 3600.0)
+    through = _through(table)
     table.finish()
     common = {"direction": direction, "domain": domain}
 
@@ -240,10 +254,13 @@ def _action(table: Table, access: Access) -> tuple[list[TopicRoute], list[Servic
         given = {"alias": f"{alias}-{suffix}", "name": f"{name}/_action/{suffix}", **common, **settings}
         return Table(given, kind)
 
+    def service(suffix: str, **settings: Any) -> ServiceRoute:
+        return _service(part(suffix, "a service", through=through, **settings), access)
+
     services = [
-        _service(part("send_goal", "a service", type=f"{action}_SendGoal"), access),
-        _service(part("cancel_goal", "a service", type="action_msgs/srv/CancelGoal"), access),
-        _service(part("get_result", "a service", type=f"{action}_GetResult", timeout=timeout), access),
+        service("send_goal", type=f"{action}_SendGoal"),
+        service("cancel_goal", type="action_msgs/srv/CancelGoal"),
+        service("get_result", type=f"{action}_GetResult", timeout=timeout),
     ]
     topics = [
         _topic(part("feedback", "a topic", type=f"{action}_FeedbackMessage"), access),
