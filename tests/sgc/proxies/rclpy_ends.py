@@ -50,6 +50,10 @@ class _Node:
         """How many subscriptions this node's publisher has found."""
         return int(self._publishers[name].get_subscription_count())
 
+    def hears(self, name: str) -> int:
+        """How many publishers this node's subscriptions have found: what others have sent before is lost."""
+        return sum(one.get_publisher_count() for one in self._subscriptions if one.topic_name == name)
+
     def publishers(self, name: str) -> list[dict[str, Any]]:
         """What ROS 2 knows of a topic's publishers."""
         found = self._node.get_publishers_info_by_topic(name)

@@ -40,6 +40,11 @@ def found(node, subscriptions, name="/chatter"):
     return until(lambda: node.subscribers(name) == subscriptions, 20.0)
 
 
+def listening(node, publishers, name="/chatter"):
+    """Has the node's subscription found so many publishers?"""
+    return until(lambda: node.hears(name) == publishers, 20.0)
+
+
 def test_300_messages_cross_each_way_in_order_and_nothing_goes_round(company, ros_domains, ros_nodes):
     here, there = next(ros_domains), next(ros_domains)
     robot, server = company(CHAT, "robot", "server")
@@ -49,6 +54,7 @@ def test_300_messages_cross_each_way_in_order_and_nothing_goes_round(company, ro
             node.subscribe("/chatter", String)
             node.advertise("/chatter", String)
             assert found(node, 2)  # its own, and the proxy's
+            assert listening(node, 2)
         assert joined(one, other)
         said = [f"message {i}" for i in range(300)]
         say(a, *said)
@@ -105,6 +111,7 @@ def test_types_of_any_kind_pass_unchanged(company, ros_domains, ros_nodes, messa
         b.subscribe("/chatter", type(message))
         a.advertise("/chatter", type(message))
         assert found(a, 1)
+        assert listening(b, 1)
         assert joined(out, into)
         a.publish("/chatter", [message])
         assert b.heard("/chatter", 1) == [message]
@@ -203,6 +210,7 @@ def test_a_web_page_talks_with_a_ros_2_node(company, ros_domains, ros_nodes):
         heard: list[str] = []
         roslibpy.Topic(page, "/chat", "std_msgs/String").subscribe(lambda message: heard.append(message["data"]))
         assert found(node, 2)
+        assert listening(node, 2)
         assert joined(ros2)
         talker = roslibpy.Topic(page, "/chat", "std_msgs/String")
         talker.publish(roslibpy.Message({"data": "from the page"}))
