@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -188,3 +190,18 @@ def test_a_gradient_that_is_no_number_is_not_hidden() -> None:
     old, new, first, second = (np.ones(3, np.float32) for _ in range(4))
     _adam(old, new, np.array([0.0, np.nan, np.inf], np.float32), first, second, np.float32(1e-3), np.float32(1.0))
     assert np.isnan(new).tolist() == [False, True, True]
+
+
+def test_loops_over_many_numbers_take_several_at_a_time() -> None:
+    import numba
+
+    from tutelage.learning.compiled import _adam
+    from tutelage.policies.compiled import ALONG, join, normalise_row
+
+    number, numbers = numba.float32, numba.float32[::1]
+    fresh = {**ALONG, "cache": False}  # what comes from the cache has no code to look at
+    for loop, arguments in (
+        (_adam, [numbers] * 5 + [number] * 2), (normalise_row, [numbers] * 4), (join, [numbers] * 7),
+    ):  # fmt: skip
+        compiled = numba.njit(numba.void(*arguments), **fresh)(loop.py_func)
+        assert any(re.search(r"fdiv [^<\n]*<\d+ x float>", code) for code in compiled.inspect_llvm().values())

@@ -6,13 +6,15 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from sgc import members
 
 from tutelage.sgc.home import Home
+from tutelage.sgc.router import Router, RouterConfig
 from tutelage.sgc.rules import Role
 
 
@@ -70,6 +72,17 @@ class Fleet(members.Fleet):
 
     def __getitem__(self, name: str) -> Home:
         return self.homes[name]
+
+
+@contextmanager
+def behind_a_router(folder: Path, policy: str, names: Sequence[str]) -> Iterator[Fleet]:
+    """A fleet whose nodes dial out to a router that runs meanwhile, with TLS, and can read nothing."""
+    fleet = Fleet(folder, policy, names, ["router"])
+    address = f"tls/127.0.0.1:{free_port()}"
+    for name in names:
+        (fleet[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
+    with Router(fleet["router"], RouterConfig.of([address])):
+        yield fleet
 
 
 def free_port() -> int:

@@ -9,7 +9,7 @@ import sys
 import urllib.request
 
 import pytest
-from sgc.fleets import Fleet, free_port, service, topic
+from sgc.fleets import behind_a_router, free_port, service, topic
 from sgc.proxies.company import stay_on_loopback
 from sgc.proxies.ros_ends import ADD, RosNode, taken, until
 from websockets.sync.client import connect
@@ -17,7 +17,6 @@ from websockets.sync.client import connect
 from tutelage.errors import ConfigError
 from tutelage.sgc.commands import proxy
 from tutelage.sgc.errors import KeysError
-from tutelage.sgc.router import Router, RouterConfig
 
 POLICY = topic("chat", ["robot", "web"], ["robot", "web"], interface="/chatter") + service(
     "add", ["robot"], ["web"], type=ADD
@@ -38,11 +37,7 @@ domain = {domain}
 
 @pytest.fixture
 def fleet(tmp_path):
-    fleet = Fleet(tmp_path, POLICY, ["robot", "web"], ["router"])
-    address = f"tls/127.0.0.1:{free_port()}"
-    for name in ("robot", "web"):
-        (fleet[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
-    with Router(fleet["router"], RouterConfig.of([address])):
+    with behind_a_router(tmp_path, POLICY, ["robot", "web"]) as fleet:
         yield fleet
 
 

@@ -9,12 +9,10 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed (make ros2 installs it beside)")
 
 from sgc.commands.test_proxy import start
-from sgc.fleets import Fleet, free_port, service, topic
+from sgc.fleets import behind_a_router, service, topic
 from sgc.proxies.ros_ends import until
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
-
-from tutelage.sgc.router import Router, RouterConfig
 
 POLICY = topic("chat", ["robot", "server"], ["robot", "server"]) + service(
     "lights", ["robot"], ["server"], type="std_srvs/srv/SetBool"
@@ -39,11 +37,7 @@ domain = {domain}
 
 @pytest.fixture
 def fleet(tmp_path):
-    fleet = Fleet(tmp_path, POLICY, ["robot", "server"], ["router"])
-    address = f"tls/127.0.0.1:{free_port()}"
-    for name in ("robot", "server"):
-        (fleet[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
-    with Router(fleet["router"], RouterConfig.of([address])):
+    with behind_a_router(tmp_path, POLICY, ["robot", "server"]) as fleet:
         yield fleet
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from sgc.fleets import Fleet, free_port, service, topic
+from sgc.fleets import behind_a_router, service, topic
 from sgc.proxies.ros_ends import ADD, STRING, AddClient, AddServer, RosNode, taken, until
 from sgc.proxies.test_ros2 import DEEP
 
 from tutelage.sgc.node import Node
 from tutelage.sgc.proxies.ros2 import Ros2Proxy
 from tutelage.sgc.proxies.routes import Routes, ServiceRoute, TopicRoute
-from tutelage.sgc.router import Router, RouterConfig
 
 POLICY = topic("chat", ["robot", "server"], ["robot", "server"]) + service("add", ["robot"], ["server"], type=ADD)
 
@@ -18,12 +17,8 @@ POLICY = topic("chat", ["robot", "server"], ["robot", "server"]) + service("add"
 @pytest.fixture
 def nodes(tmp_path):
     """Robot and server, each dialling out to a router that can read nothing."""
-    fleet = Fleet(tmp_path, POLICY, ["robot", "server"], ["router"])
-    address = f"tls/127.0.0.1:{free_port()}"
-    for name in ("robot", "server"):
-        (fleet[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
     with (
-        Router(fleet["router"], RouterConfig.of([address])),
+        behind_a_router(tmp_path, POLICY, ["robot", "server"]) as fleet,
         Node.open(fleet["robot"].path) as robot,
         Node.open(fleet["server"].path) as server,
     ):

@@ -16,14 +16,13 @@ import time
 import uuid
 from collections.abc import Callable
 
-from tutelage.sgc.proxies.dds_domain import OTHER_MIDDLEWARE, Domain
+from tutelage.sgc.proxies.dds_domain import OTHER_MIDDLEWARE, Domain, Reader, Writer
 from tutelage.sgc.proxies.dds_raw import HEADER
 from tutelage.sgc.proxies.ros_names import service_channels
-from tutelage.sgc.proxies.ros_services import Request
+from tutelage.sgc.proxies.ros_services import Request, wait_for_reply, wait_for_server
 from tutelage.sgc.proxies.routes import ServiceRoute
 
 _IDENTITY = struct.Struct("<Qq")  # client, sequence number
-_MATCH_POLL = 0.02  # seconds
 
 
 def _with_identity(message: bytes, identity: bytes) -> tuple[bytes, bytes, bytes]:
@@ -44,26 +43,33 @@ def _service_id(kind: str) -> dict[str, str]:
     return {kind: ".".join(f"{byte:x}" for byte in uuid.uuid4().bytes)}
 
 
-class DdsOffered:
-    """A service that is offered on a domain; see `ros_services.Offered`."""
+class _DdsEnd:
+    """What both ends have: a reader and a writer."""
 
-    def __init__(self, domain: Domain, route: ServiceRoute, put: Callable[[Request], None]) -> None:
-        self._malformed = 0
-        self._put = put
-        requests, replies = service_channels(route.name, route.type)
-        ids = _service_id("serviceid")
-        self._writer = domain.writer(replies, route.qos, ids)
-        self._reader = domain.reader(requests, route.qos, self._on_request, pairs=ids, cyclone_only=True)
+    _reader: Reader
+    _writer: Writer
+    _malformed = 0
 
     @property
     def malformed(self) -> int:
-        """See `Offered.malformed`."""
+        """How many samples came that are no requests or replies, those of another middleware among them."""
         return self._malformed + self._reader.foreign
 
     @property
     def incompatible(self) -> tuple[int, str]:
         """See `Reader.incompatible`."""
         return max(self._reader.incompatible, self._writer.incompatible)
+
+
+class DdsOffered(_DdsEnd):
+    """A service that is offered on a domain; see `ros_services.Offered`."""
+
+    def __init__(self, domain: Domain, route: ServiceRoute, put: Callable[[Request], None]) -> None:
+        self._put = put
+        requests, replies = service_channels(route.name, route.type)
+        ids = _service_id("serviceid")
+        self._writer = domain.writer(replies, route.qos, ids)
+        self._reader = domain.reader(requests, route.qos, self._on_request, pairs=ids, cyclone_only=True)
 
     def reply(self, asker: bytes, message: bytes) -> None:
         """See `Offered.reply`."""
@@ -77,11 +83,10 @@ class DdsOffered:
             self._put(Request(*parts))
 
 
-class DdsUsed:
+class DdsUsed(_DdsEnd):
     """A service of a domain, used as a client; see `ros_services.Used`."""
 
     def __init__(self, domain: Domain, route: ServiceRoute) -> None:
-        self._malformed = 0
         self._route = route
         self._client = secrets.randbits(63)
         self._sequence = 0
@@ -91,16 +96,6 @@ class DdsUsed:
         ids = _service_id("clientid")
         self._reader = domain.reader(replies, route.qos, self._on_reply, pairs=ids, cyclone_only=True)
         self._writer = domain.writer(requests, route.qos, ids)
-
-    @property
-    def malformed(self) -> int:
-        """See `Used.malformed`."""
-        return self._malformed + self._reader.foreign
-
-    @property
-    def incompatible(self) -> tuple[int, str]:
-        """See `Reader.incompatible`."""
-        return max(self._reader.incompatible, self._writer.incompatible)
 
     def call(self, request: bytes) -> bytes:
         """See `Used.call`."""
@@ -112,23 +107,15 @@ class DdsUsed:
             identity = _IDENTITY.pack(self._client, self._sequence)
             self._waiting[identity] = waiting
         try:
-            self._wait_for_server(until)
+            wait_for_server(lambda: bool(self._writer.matched and self._reader.matched), route, until)
+            if self._writer.foreign:  # it would take the identity for the beginning of the request
+                raise ConnectionRefusedError(f"{route.name}: {OTHER_MIDDLEWARE}")
             self._writer.write(*_with_identity(request, identity))
-            if not waiting.event.wait(max(0.0, until - time.monotonic())):
-                raise TimeoutError(f"the ROS 2 server of {route.name} did not answer within {route.timeout:g} s")
+            wait_for_reply(waiting.event, route, until)
         finally:
             with self._lock:
                 del self._waiting[identity]
         return waiting.message
-
-    def _wait_for_server(self, until: float) -> None:
-        """A request that is written before discovery has found the server, or the server us, is lost."""
-        while not (self._writer.matched and self._reader.matched):
-            if time.monotonic() > until:
-                raise TimeoutError(f"there is no ROS 2 server of {self._route.name} on domain {self._route.domain}")
-            time.sleep(_MATCH_POLL)
-        if self._writer.foreign:  # it would take the identity for the beginning of the request
-            raise ConnectionRefusedError(f"{self._route.name}: {OTHER_MIDDLEWARE}")
 
     def _on_reply(self, sample: bytes) -> None:
         parts = _split(sample)

@@ -13,10 +13,8 @@ from typing import Any
 from tutelage.errors import ConfigError
 from tutelage.sgc.proxies.rclpy_domain import RclpyDomain, service_type
 from tutelage.sgc.proxies.ros_qos import QosProfile
-from tutelage.sgc.proxies.ros_services import Request
+from tutelage.sgc.proxies.ros_services import Request, wait_for_reply, wait_for_server
 from tutelage.sgc.proxies.routes import ServiceRoute
-
-_READY_POLL = 0.02  # seconds
 
 
 class _RclpyEnd:
@@ -85,27 +83,23 @@ class RclpyUsed(_RclpyEnd):
         route = self._route
         until = time.monotonic() + route.timeout
         parsed = self._parsed(request, self._type.Request)
-        self._wait_for_server(until)
+        wait_for_server(self._client.service_is_ready, route, until)
+        if self._domain.other_proxy_serves(route.name):
+            raise ConnectionRefusedError(
+                f"another proxy brings {route.name} to domain {route.domain}; the request would go round"
+            )
         answered = threading.Event()
         try:
             future = self._client.call_async(parsed)
         except Exception as error:  # such as: the node is closed
             raise OSError(f"rclpy could not ask {route.name}: {error}") from None
         future.add_done_callback(lambda _: answered.set())
-        if not answered.wait(max(0.0, until - time.monotonic())):
+        try:
+            wait_for_reply(answered, route, until)
+        except TimeoutError:
             self._client.remove_pending_request(future)
-            raise TimeoutError(f"the ROS 2 server of {route.name} did not answer within {route.timeout:g} s")
+            raise
         return bytes(serialize_message(future.result()))
-
-    def _wait_for_server(self, until: float) -> None:
-        """A request that is sent before discovery has found the server is lost."""
-        name, number = self._route.name, self._domain.number
-        while not self._client.service_is_ready():
-            if time.monotonic() > until:
-                raise TimeoutError(f"there is no ROS 2 server of {name} on domain {number}")
-            time.sleep(_READY_POLL)
-        if self._domain.other_proxy_serves(name):
-            raise ConnectionRefusedError(f"another proxy brings {name} to domain {number}; the request would go round")
 
 
 def _rclpy_qos(profile: QosProfile) -> Any:

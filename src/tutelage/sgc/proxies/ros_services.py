@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 _WORKERS = 8
 _WAITING = 64
+_READY_POLL = 0.02  # seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,30 @@ class Used(_End, Protocol):
             ValueError: not a message of the service.
             OSError: there is no server, it did not answer in time, or the request could not be sent; the message says which.
         """
+
+
+def wait_for_server(ready: Callable[[], bool], route: ServiceRoute, until: float) -> None:
+    """Until discovery has found the server, and it us: a request that is sent before is lost.
+
+    until: by `time.monotonic`.
+
+    Raises:
+        TimeoutError: there is none.
+    """
+    while not ready():
+        if time.monotonic() > until:
+            raise TimeoutError(f"there is no ROS 2 server of {route.name} on domain {route.domain}")
+        time.sleep(_READY_POLL)
+
+
+def wait_for_reply(answered: threading.Event, route: ServiceRoute, until: float) -> None:
+    """Until the server has answered.
+
+    Raises:
+        TimeoutError: not in time.
+    """
+    if not answered.wait(max(0.0, until - time.monotonic())):
+        raise TimeoutError(f"the ROS 2 server of {route.name} did not answer within {route.timeout:g} s")
 
 
 class Client:
