@@ -18,16 +18,31 @@ from tutelage.sgc.packet import BODY, HEADER, MAX_PACKET, PROOF, make_header, no
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.sealing import Opener, Sealer
 
-STREAMS = [("camera", "drone-1", "server"), ("teleop", "operator-1", "server"), ("lidar", "drone-1", "server")]
-"""Topics with signatures, sessions and chains."""
+STREAMS = [
+    ("camera", "drone-1", "server"),
+    ("teleop", "operator-1", "server"),
+    ("teleop to two", "operator-1", "server"),
+    ("lidar", "drone-1", "server"),
+]
+"""Topics with signatures, a session, two of them, and chains."""
 COUNT = 10_000
-Fields = namedtuple("Fields", "version mode flags introduction proof epoch sender salt first sent")
+Fields = namedtuple("Fields", "version mode flags introduction proof epoch sender salt first sent label")
 HONEST = [b"%d" % k * 9 for k in range(30)]
 
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory) -> Fleet:
     return Fleet(tmp_path_factory.mktemp("fleet"))
+
+
+def ends(fleet: Fleet, stream: str, sender: str, receiver: str) -> tuple[Sealer, Opener]:
+    """Of one of the streams."""
+    alias, *to_two = stream.split(maxsplit=1)
+    sealer, opener = fleet.pair(alias, sender, receiver)
+    if to_two:
+        other = fleet.opener("drone-1", alias)
+        other.complete_session(sealer.accept_session(other.offer_session()))
+    return sealer, opener
 
 
 def seeded(name: str) -> random.Random:
@@ -65,13 +80,13 @@ def noise(packets: list[bytes], dice: random.Random) -> bytes:
 def header(packets: list[bytes], dice: random.Random) -> bytes:
     """A header with fields of an attacker's choice before the genuine rest."""
     packet = dice.choice(packets)
-    fields = Fields._make(struct.unpack(">BBHHHI16s16sQQ", packet[:HEADER]))
+    fields = Fields._make(struct.unpack(">BBHHHI16s16sQQ16s", packet[:HEADER]))
     changes = {
         "version": dice.choice([0, 1, 2, 255]), "mode": dice.choice([0, 1, 2, 3, 255]), "flags": dice.randrange(65536),
         "epoch": dice.choice([0, fields.epoch - 1, fields.epoch + 1, 2**32 - 1]), "introduction": dice.randrange(65536),
-        "proof": dice.choice([0, 1, 15, 16, 80, fields.proof + 1, 65535]), "sender": dice.randbytes(16),
+        "proof": dice.choice([0, 1, 8, 15, 16, 24, 48, 80, fields.proof + 1, 65535]), "sender": dice.randbytes(16),
         "salt": dice.randbytes(16), "first": dice.choice([0, 1, fields.first + 1, 2**63, 2**64 - 1]),
-        "sent": dice.choice([0, fields.sent + 1, 2**63, 2**64 - 1]),
+        "sent": dice.choice([0, fields.sent + 1, 2**63, 2**64 - 1]), "label": dice.randbytes(16),
     }  # fmt: skip
     chosen = dice.sample(sorted(changes), dice.randrange(1, 4))
     return make_header(*fields._replace(**{name: changes[name] for name in chosen})) + packet[HEADER:]
@@ -107,11 +122,13 @@ def deliver(opener: Opener, packets: list[bytes], now: int | None = None) -> lis
 def test_whatever_is_made_of_packets_is_refused(
     fleet: Fleet, alias: str, sender: str, receiver: str, kind: Callable[[list[bytes], random.Random], bytes]
 ) -> None:
-    sealer, opener = fleet.pair(alias, sender, receiver)
+    sealer, opener = ends(fleet, alias, sender, receiver)
     now = time.time_ns()
     genuine = honest_packets(sealer, now)
     dice = seeded(f"{alias} {kind.__name__}")
-    attacks = [attack for attack in (kind(genuine, dice) for _ in range(COUNT)) if attack not in genuine]
+    end = -24 if alias.endswith("two") else None  # the other receiver's tag is none of our business
+    ours = [packet[:end] for packet in genuine]
+    attacks = [attack for attack in (kind(genuine, dice) for _ in range(COUNT)) if attack[:end] not in ours]
     assert deliver(opener, attacks, now) == []
     assert opener.refusals.total() == len(attacks)
     assert sorted(deliver(opener, genuine, now)) == sorted(HONEST)  # and nothing of it harmed the honest
@@ -119,7 +136,7 @@ def test_whatever_is_made_of_packets_is_refused(
 
 @pytest.mark.parametrize(("alias", "sender", "receiver"), STREAMS)
 def test_repetition_and_reordering_deliver_every_message_once(fleet: Fleet, alias: str, sender: str, receiver: str) -> None:
-    sealer, opener = fleet.pair(alias, sender, receiver)
+    sealer, opener = ends(fleet, alias, sender, receiver)
     now = time.time_ns()
     packets = honest_packets(sealer, now)
     dice = seeded(alias)
@@ -130,7 +147,7 @@ def test_repetition_and_reordering_deliver_every_message_once(fleet: Fleet, alia
 
 @pytest.mark.parametrize(("alias", "sender", "receiver"), STREAMS)
 def test_a_restarted_receiver_does_not_take_old_messages_again(fleet: Fleet, alias: str, sender: str, receiver: str) -> None:
-    sealer, opener = fleet.pair(alias, sender, receiver)
+    sealer, opener = ends(fleet, alias, sender, receiver)
     old = time.time_ns() - 6 * 10**9
     packets = [bytes(sealer.seal(b"x", now=old)), *([sealer.flush(now=old)] if alias == "lidar" else [])]
     assert deliver(opener, packets) == []
@@ -214,7 +231,7 @@ def test_a_signed_message_cannot_be_sealed_again_for_another_place(fleet: Fleet)
     sealer, opener = fleet.pair("camera", "drone-1", "operator-1")
     opener.open(sealer.seal(b"introduction"))
     packet = bytes(sealer.seal(b"go"))
-    fields = Fields._make(struct.unpack(">BBHHHI16s16sQQ", packet[:HEADER]))
+    fields = Fields._make(struct.unpack(">BBHHHI16s16sQQ16s", packet[:HEADER]))
     cipher = sealer._cipher  # members can derive it
     assert cipher is not None
     signature = cipher.decrypt(nonce(PROOF, packet), packet[-80:], packet[:HEADER])

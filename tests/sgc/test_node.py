@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 import time
@@ -15,9 +16,11 @@ from tutelage.errors import ConfigError
 from tutelage.sgc import backlog, lanes
 from tutelage.sgc import publisher as publishing
 from tutelage.sgc.errors import NotAllowed, NotIssued
+from tutelage.sgc.frames import PIECE
 from tutelage.sgc.history import make_request
 from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
+from tutelage.sgc.publisher import PATIENT
 from tutelage.sgc.service import RequestFailed
 from tutelage.sgc.transport.base import Congested, NoReply
 from tutelage.sgc.transport.memory import MemoryTransport, Network
@@ -102,6 +105,44 @@ def test_a_message_of_14_mb_arrives(arm: Node, server: Node, mode: str) -> None:
     payload = os.urandom(14 << 20)
     log.send(payload)
     eventually(lambda: [m.payload for m in got] == [payload])
+
+
+def test_renewed_sessions_do_not_add_up(arm: Node, server: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a topic with one receiver would be sealed for two, after ten minutes and for ever."""
+    monkeypatch.setattr("tutelage.sgc.subscription.OFFER_EVERY", 0.2)
+    got = Received()
+    server.subscribe("log-session", got)
+    log = arm.publisher("log-session")
+    acquainted(log.send, got)
+    seen: set[bytes] = set()
+    numbers = itertools.count()
+
+    def renewed() -> bool:
+        log.send(b"%d" % next(numbers))
+        seen.update(session.ident for session in log._sealer._sessions)
+        return len(seen) > 3 and len(log._sealer._sessions) == 1
+
+    eventually(renewed, every=0.02)
+    sent = next(numbers)
+    eventually(lambda: in_order(got, sent))
+
+
+def test_a_patient_caller_sends_large_messages_itself(network: Network, arm: Node) -> None:
+    """Everybody else leaves them to the publisher's thread, as the network may be slow."""
+    log = arm.publisher("log-signature")
+    threads: list[str] = []
+
+    def tap(key: str, packet: bytes) -> list[tuple[str, bytes]]:
+        if len(packet) > PIECE:
+            threads.append(threading.current_thread().name)
+        return [(key, packet)]
+
+    network.tap = tap
+    for wait in (PATIENT, 0.0):
+        eventually(lambda: not log._busy and time.monotonic() > log._free_at)
+        log.send(bytes(PIECE), wait=wait)
+        assert log.flush(5.0)
+    assert threads == [threading.current_thread().name, "sgc-publish-log-signature"]
 
 
 def test_iterating_over_a_subscription(arm: Node, server: Node) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import struct
 import time
+from dataclasses import replace
 
 import pytest
+from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from members import POLICY, Fleet
 
 from tutelage.sgc.errors import NotAllowed
-from tutelage.sgc.packet import HEADER, MODES, make_header, message_key
+from tutelage.sgc.packet import BODY, HEADER, MODES, make_header, message_key, nonce
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.rules import Lane
 from tutelage.sgc.session import MAX_SESSIONS
@@ -60,15 +62,19 @@ def test_a_receiver_with_a_session_cannot_forge_for_another_receiver(fleet: Flee
     forger = fleet.sealer("operator-1", "teleop")  # stands for drone-1 using the topic's key under operator-1's id and salt
     forger.salt, forger.sequence = sealer.salt, sealer.sequence + 10
     forger.seal(b"")
-    forger._sessions = list(traitor._sessions.values())
+    forger._open(list(traitor._sessions.values()))
     forged = forger.seal(b"stop everything")
     assert traitor.open(forged).payload == b"stop everything"  # it can only fool itself
     assert reason(honest.open, forged) == Reason.NO_SESSION
-    forger._sessions = [
-        type(own)(ident=other.ident, member=own.member, until=own.until, cipher=own.cipher)
-        for own, other in zip(traitor._sessions.values(), honest._sessions.values(), strict=True)
-    ]
-    assert reason(honest.open, forger.seal(b"stop everything")) == Reason.FORGED
+    forger._open(
+        [
+            replace(own, ident=other.ident)
+            for own, other in zip(traitor._sessions.values(), honest._sessions.values(), strict=True)
+        ]
+    )
+    assert reason(honest.open, forger.seal(b"stop everything")) == Reason.TAMPERED  # it does not have the key of the two
+    forger._open(2 * forger._sessions)
+    assert reason(honest.open, forger.seal(b"stop everything")) == Reason.FORGED  # nor can it make their tag
 
 
 def test_only_receivers_may_offer_and_only_senders_may_answer(fleet: Fleet) -> None:
@@ -152,7 +158,7 @@ def test_packets_of_a_session_carry_no_credential(fleet: Fleet) -> None:
     """A credential excuses a packet from the look at whom its stream is known to be of."""
     sealer, opener = fleet.pair("teleop", "operator-2", "server")
     packet = sealer.seal(b"x")
-    version, mode, flags, _, *rest = struct.unpack(">BBHHHI16s16sQQ", packet[:HEADER])
+    version, mode, flags, _, *rest = struct.unpack(">BBHHHI16s16sQQ16s", packet[:HEADER])
     forged = make_header(version, mode, flags, 3, *rest) + b"abc" + packet[HEADER:]
     assert reason(opener.open, forged) == Reason.MALFORMED
     assert opener.open(packet).payload == b"x"
@@ -184,9 +190,11 @@ def test_what_a_message_is_bound_to_is_under_the_tag_of_the_session(fleet: Fleet
         return product
 
     sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    second = fleet.opener("drone-1", "teleop")
+    second.complete_session(sealer.accept_session(second.offer_session()))
     bind = bytes(range(40))
     packet = sealer.seal(b"yes", bind=bind)
-    _, _, _, _, _, epoch, sender, salt, _, _ = struct.unpack(">BBHHHI16s16sQQ", packet[:HEADER])
+    _, _, _, _, _, epoch, sender, salt, *_ = struct.unpack(">BBHHHI16s16sQQ16s", packet[:HEADER])
     entry = fleet.homes["server"].access.entry("teleop")
     epoch_key = fleet.keyrings["server"].opening("teleop", epoch).key
     key = message_key(epoch_key, bytes(entry.name), Lane.STREAM, epoch, sender, salt)
@@ -200,3 +208,83 @@ def test_what_a_message_is_bound_to_is_under_the_tag_of_the_session(fleet: Fleet
     with pytest.raises(Refused):
         opener.open(packet)
     assert opener.open(packet, bind=bind).payload == b"yes"
+
+
+def meet(sealer, opener) -> None:
+    opener.complete_session(sealer.accept_session(opener.offer_session()))
+
+
+def test_a_message_for_one_receiver_is_sealed_for_it_alone(fleet: Fleet) -> None:
+    """Other members of the topic, who have its key, cannot even read it; a second receiver ends that."""
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    other = fleet.opener("drone-1", "teleop")
+    packet = sealer.seal(b"left", bind=b"request")
+    assert reason(other.open, packet, bind=b"request") == Reason.NO_SESSION
+    with pytest.raises(InvalidTag):
+        sealer._cipher.decrypt(nonce(BODY, packet[:HEADER]), packet[HEADER:-8], packet[:HEADER] + b"request")
+    assert reason(opener.open, packet, bind=b"another") == Reason.TAMPERED
+    assert opener.open(packet, bind=b"request").payload == b"left"
+    meet(sealer, other)
+    both = sealer.seal(b"right")
+    assert [each.open(both).payload for each in (opener, other)] == [b"right", b"right"]
+    assert len(both) == len(sealer.seal(b"right"))
+
+
+def test_a_session_alone_ends_with_the_epoch_of_the_topic_too(fleet: Fleet) -> None:
+    """Who is denied the next key of the topic cannot read on, although the session is open."""
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    before = sealer.seal(b"x")
+    pushes = {push.node: push.grant for push in fleet.keyrings["operator-1"].rotate("teleop", delay=0.0)}
+    after = sealer.seal(b"y")
+    assert opener.open(before).payload == b"x"
+    assert reason(opener.open, after) == Reason.UNKNOWN_EPOCH
+    fleet.keyrings["server"].accept("teleop", pushes["server"])
+    assert opener.open(after).payload == b"y"
+
+
+def test_a_renewed_session_replaces_the_earlier_one(fleet: Fleet) -> None:
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    assert opener.replacements() == []
+    early = sealer.seal(b"early")
+    meet(sealer, opener)
+    assert len(sealer._sessions) == 2
+    between = sealer.seal(b"between")
+    (replacement,) = opener.replacements()
+    assert opener.replacements() == []
+    sealer.end_session(replacement)
+    sealer.end_session(replacement)  # repeated by a router
+    assert len(sealer._sessions) == 1
+    late = sealer.seal(b"late")
+    assert [opener.open(packet).payload for packet in (late, between, early)] == [b"late", b"between", b"early"]
+
+
+def test_nobody_else_can_end_a_session(fleet: Fleet) -> None:
+    """Neither a router with bytes of its own, nor another receiver, nor a replacement that went to another sender."""
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    traitor = fleet.opener("drone-1", "teleop")
+    meet(sealer, traitor)
+    victim, own = sealer._sessions
+    for wrong in (b"", b"x" * 31, own.ident + victim.ident + b"x" * 16):
+        assert reason(sealer.end_session, wrong) in (Reason.MALFORMED, Reason.FORGED)
+    sealer.end_session(own.replacing(victim.ident))  # genuine, but about a session that is not its own
+    sealer.end_session(b"x" * 32)  # of another sender
+    assert sealer._sessions == [victim, own]
+    meet(sealer, opener)
+    (replacement,) = opener.replacements()
+    fleet.sealer("operator-2", "teleop").end_session(replacement)
+    for at in range(8, len(replacement)):
+        changed = bytearray(replacement)
+        changed[at] ^= 1
+        assert reason(sealer.end_session, bytes(changed)) == Reason.FORGED
+    assert len(sealer._sessions) == 3
+    sealer.end_session(replacement)
+    assert victim not in sealer._sessions
+    assert len(sealer._sessions) == 2
+
+
+def test_an_expired_session_of_a_packet_does_not_hide_the_one_that_is_open(fleet: Fleet) -> None:
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    meet(sealer, opener)
+    first = next(iter(opener._sessions))
+    opener._sessions[first] = replace(opener._sessions[first], until=0)
+    assert opener.open(sealer.seal(b"x")).payload == b"x"

@@ -26,9 +26,9 @@ class Assembler:
     def messages(self, opened: list[Opened], received: float) -> list[Message]:
         """The messages that these frames complete. received: seconds since 1970."""
         messages, alias = [], self._alias
-        for frame, sender, sequence, salt, sent, _, authentic, _ in opened:
+        for body, sender, sequence, salt, sent, _, authentic, _, label in opened:
             try:
-                payload = (self._assemblies.get(salt) or self._begin(salt)).take(sequence, frame)
+                payload = (self._assemblies.get(salt) or self._begin(salt)).take(sequence, label, body)
             except Refused as refused:
                 self._refusals.add(refused.reason)
                 continue

@@ -104,7 +104,7 @@ class Delivery(ABC):
 
     @abstractmethod
     def accept(self, message: Opened, now: float) -> list[Opened]:
-        """Take a message, with its frame; returns those that are to be delivered now."""
+        """Take a message; returns those that are to be delivered now."""
 
     def accept_all(self, messages: list[Opened], now: float) -> list[Opened]:
         """The same for all messages of a packet, of which there is at least one."""
@@ -153,7 +153,7 @@ class Delivery(ABC):
             self._past.append(stream.salt)
             left = self._release_all(stream, now)
         # Begun after us: whatever came before this message was meant for us too.
-        ours = not self.from_first_heard and age_of(message.payload) <= now - self.started + SLACK
+        ours = not self.from_first_heard and age_of(message.label) <= now - self.started + SLACK
         first = 1 if ours else message.sequence
         stream = self._current[message.sender] = Stream(
             message.sender, message.salt, message.sent, first, patience=self.patience

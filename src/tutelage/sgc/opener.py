@@ -30,6 +30,7 @@ from tutelage.sgc.packet import (
     SESSION_ID,
     SIGNATURE,
     SLOT,
+    SOLE,
     TAG,
     Buffer,
     Opened,
@@ -95,6 +96,7 @@ class Opener:
         self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
         self._members: OrderedDict[bytes, Member] = OrderedDict()
         self._sessions: OrderedDict[bytes, Session] = OrderedDict()  # by sender, salt and id
+        self._replacements: list[bytes] = []
 
     def open(self, packet: Buffer, *, bind: bytes = b"", now: int | None = None) -> Opened:
         """The one message of a packet.
@@ -141,10 +143,20 @@ class Opener:
         with self._lock:
             with self.refusals.counting():
                 sender, salt, session = self._handshake.complete(answer)
-            self._sessions[sender + salt + session.ident] = session
+            start = sender + salt
+            earlier = [one.ident for key, one in self._sessions.items() if key.startswith(start)]
+            self._replacements += map(session.replacing, earlier[-1:])
+            self._sessions[start + session.ident] = session
             while len(self._sessions) > _MAX_SESSIONS:
                 self._sessions.popitem(last=False)
             return session.member.node
+
+    def replacements(self) -> list[bytes]:
+        """Session mode: what is to be told to senders whose earlier sessions are replaced, each once, for their
+        `Sealer.end_session`. Nothing is lost if it does not reach them; they go on sealing for both."""
+        with self._lock:
+            told, self._replacements = self._replacements, []
+            return told
 
     def _open(self, packet: Buffer, bind: bytes, now: int) -> list[Opened]:
         size = len(packet)
@@ -155,7 +167,7 @@ class Opener:
         if size < HEADER + TAG:
             raise Refused(Reason.MALFORMED, f"a packet of {size} bytes")
         raw = bytes(packet[:HEADER])
-        layout, name, first, sent = read_header(raw)
+        layout, name, first, sent, label = read_header(raw)
         flags, introduction, proof = read_layout(layout, self._mode)
         start, end = HEADER + introduction, size - proof
         if first == 0 or start + TAG > end:
@@ -171,19 +183,25 @@ class Opener:
             _decrypt(stream.cipher, BARE_BODY, packet[start:end], raw)
             member = self._member(stream, raw, packet[HEADER:start], now)
             return self._anchor(stream, BARE_PROOF, raw, packet[end:], member, now)
-        body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
-        if self._mode == SESSION:
-            member = self._session_member(stream, raw, packet, end, bind, now)
+        if flags & SOLE:
+            session = self._session(stream, packet[end:], now)
+            if session is None:
+                raise self._no_session()
+            body, member = _decrypt(stream.sole_cipher(session), BODY, packet[start:end], raw + bind), session.member
         else:
-            member = self._member(stream, raw, packet[HEADER:start], now)
+            body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
+            if self._mode == SESSION:
+                member = self._session_member(stream, raw, packet, end, bind, now)
+            else:
+                member = self._member(stream, raw, packet[HEADER:start], now)
         node, epoch, salt, authentic, began = member.node, stream.epoch, stream.salt, self._authentic, stream.start
         if flags & BATCH:
             messages = [
-                make_opened((part, node, sequence, salt, sent, epoch, authentic, began))
+                make_opened((part, node, sequence, salt, sent, epoch, authentic, began, label))
                 for sequence, part in enumerate(split_batch(body), first)
             ]
         else:
-            messages = [make_opened((body, node, first, salt, sent, epoch, authentic, began))]
+            messages = [make_opened((body, node, first, salt, sent, epoch, authentic, began, label))]
         if self._mode == CHAIN:
             return self._chained(stream, flags, raw, bind, body, packet[end:], member, messages, now)
         if self._mode == SIGNATURE:
@@ -238,7 +256,8 @@ class Opener:
         """
         key = self._keyring.opening(self.alias, stream.epoch, now / 1e9).key
         if stream.look == _NEVER:
-            stream.cipher = AESGCM(message_key(key, self._name, self.lane, stream.epoch, stream.sender, stream.salt))
+            stream.key = message_key(key, self._name, self.lane, stream.epoch, stream.sender, stream.salt)
+            stream.cipher = AESGCM(stream.key)
         if introduced:
             return
         if stream.member is not None:
@@ -276,13 +295,23 @@ class Opener:
     def _session_member(self, stream: _Stream, raw: bytes, packet: Buffer, end: int, bind: bytes, now: int) -> Member:
         """Who the sender is, from the tag that it made for us."""
         for at in range(end, len(packet), SLOT):
-            session = self._sessions.get(stream.start + packet[at : at + SESSION_ID])
-            if session is not None and now < session.until:
+            session = self._session(stream, packet[at : at + SESSION_ID], now)
+            if session is not None:
                 session.check(raw, packet[:end], packet[at + SESSION_ID : at + SLOT], bind)
-                if session.member is not stream.member:  # else `_look_at_stream` has checked it
-                    self._check(session.member, now)
                 return session.member
-        raise Refused(Reason.NO_SESSION, f"a packet of {self.alias} by a sender with whom no session is open")
+        raise self._no_session()
+
+    def _session(self, stream: _Stream, ident: Buffer, now: int) -> Session | None:
+        """The open session with this id, with a sender who may send, now."""
+        session = self._sessions.get(stream.start + ident)
+        if session is None or now >= session.until:
+            return None
+        if session.member is not stream.member:  # else `_look_at_stream` has checked it
+            self._check(session.member, now)
+        return session
+
+    def _no_session(self) -> Refused:
+        return Refused(Reason.NO_SESSION, f"a packet of {self.alias} by a sender with whom no session is open")
 
     def _check(self, member: Member, now: int) -> None:
         self._home.trust.check(member, now / 1e9)
@@ -313,13 +342,14 @@ class _Stream:
     Attributes:
         name: epoch, sender and salt, as in a header.
         start: sender and salt.
-        cipher: of its packets; not there before the first look.
+        key, cipher: of its packets; not there before the first look.
         look: when it was last checked, in looks.
         member: who it is; None before the first authentic packet.
     """
 
-    __slots__ = ("cipher", "epoch", "look", "member", "name", "salt", "sender", "start")
+    __slots__ = ("_sole", "cipher", "epoch", "key", "look", "member", "name", "salt", "sender", "start")
 
+    key: bytes
     cipher: AESGCM
 
     def __init__(self, name: bytes) -> None:
@@ -328,6 +358,14 @@ class _Stream:
         self.start: bytes = self.sender + self.salt
         self.look = _NEVER
         self.member: Member | None = None
+        self._sole: tuple[Session, AESGCM] | None = None
+
+    def sole_cipher(self, session: Session) -> AESGCM:
+        """Of packets that are sealed for one session alone."""
+        sole = self._sole
+        if sole is None or sole[0] is not session:
+            sole = self._sole = session, session.sole(self.key)
+        return sole[1]
 
 
 def _decrypt(cipher: AESGCM, purpose: bytes, sealed: Buffer, associated: bytes) -> bytes:

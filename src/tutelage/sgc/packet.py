@@ -1,12 +1,13 @@
 """What a packet looks like, and the two digests that proofs are made over.
 
-    header (60 bytes) | introduction, sometimes | ciphertext | tag (16) | proof of the sender
+    header (76 bytes) | introduction, sometimes | ciphertext | tag (16) | proof of the sender
 
     header: version 1 | mode 1 | flags 2 | length of introduction 2 | of proof 2 | epoch 4 | sender 16 | salt 16 |
-            sequence 8 | sent 8
+            sequence 8 | sent 8 | label 16
 
 All integers are big endian; `sent` is in nanoseconds since 1970. The header is in clear and authenticated. The sender is a
-key id that only members of the topic can link to a node; it differs from topic to topic.
+key id that only members of the topic can link to a node; it differs from topic to topic. The label says what kind of frame
+the message is (`tutelage.sgc.frames`); in front of the message itself it would cost a copy of it at either end.
 """
 
 from __future__ import annotations
@@ -35,28 +36,31 @@ MAX_BATCH = 65_536
 MAX_PART = 65_535
 TAG = 16
 SALT_BYTES = 16
-VERSION = 1
+VERSION = 2
 SIGNATURE, SESSION, CHAIN = 1, 2, 3
 MODES = {Authenticity.SIGNATURE: SIGNATURE, Authenticity.SESSION: SESSION, Authenticity.CHAIN: CHAIN}
-_HEADER = struct.Struct(">BBHHHI16s16sQQ")
+_HEADER = struct.Struct(">BBHHHI16s16sQQ16s")
 _LAYOUT = struct.Struct(">BBHHH")
 _STREAM = struct.Struct(">I16s16s")
 HEADER = _HEADER.size
 _FLAGS = 3
 _IDENT, _SEQUENCE = slice(12, 52), slice(44, 52)
+NO_LABEL = bytes(16)
 SESSION_ID = 8
 SLOT = SESSION_ID + TAG
 """Bytes of a session in a proof: its id, and a tag."""
 MAX_SESSIONS = 16
 MAX_PACKET = HEADER + MAX_PAYLOAD + 4 * (MAX_BATCH + 1) + TAG + 2 * MAX_PART
-_CONTEXT = b"tutelage message 1"
+_CONTEXT = b"tutelage message 2"
 _CHUNK = 1 << 20
 _COUNT = struct.Struct(">I")
 
-BATCH, ANCHOR, BARE = 1, 2, 4
-"""Flags: the body holds many messages; the proof confirms earlier ones too; there is no message, only a proof."""
+BATCH, ANCHOR, BARE, SOLE = 1, 2, 4, 8
+"""Flags: the body holds many messages; the proof confirms earlier ones too; there is no message, only a proof; the body is
+sealed for one session, whose id is all the proof there is."""
+_ALLOWED = {SIGNATURE: BATCH, SESSION: BATCH | SOLE, CHAIN: BATCH | ANCHOR | BARE}
 
-BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG, BOUND_TAG = (p.to_bytes(4, "big") for p in range(7))
+BODY, PROOF, BARE_BODY, BARE_PROOF, INTRODUCTION, SESSION_TAG, BOUND_TAG, REPLACED = (p.to_bytes(4, "big") for p in range(8))
 """What a nonce is for: the first 4 of its 12 bytes, so that one sequence number serves several without repetition."""
 
 
@@ -71,8 +75,8 @@ class Layout(NamedTuple):
 make_header = _HEADER.pack
 """The fields of a header as bytes: all that the table above names, in its order."""
 
-read_header = struct.Struct(">8s36sQQ").unpack
-"""The layout in 8 bytes, the stream in 36, and two numbers: sequence and time of sending."""
+read_header = struct.Struct(">8s36sQQ16s").unpack
+"""The layout in 8 bytes, the stream in 36, two numbers, sequence and time of sending, and the label."""
 
 read_stream = _STREAM.unpack
 """Epoch, sender and salt."""
@@ -90,9 +94,9 @@ def read_layout(start: bytes, mode: int) -> Layout:
         raise Refused(Reason.MALFORMED, f"a packet of version {version}; this is version {VERSION}")
     if found != mode:
         raise Refused(Reason.WRONG_MODE, f"authenticity {found}, and the policy says {mode}")
-    if flags > 7 or (flags & (ANCHOR | BARE) and (mode != CHAIN or not flags & ANCHOR)):
+    if flags & ~_ALLOWED[mode] or (flags & BARE and not flags & ANCHOR):
         raise Refused(Reason.MALFORMED, "a packet with flags of another mode")
-    if mode == SESSION and (proof % SLOT or proof > SLOT * MAX_SESSIONS):
+    if mode == SESSION and (proof != SESSION_ID if flags & SOLE else proof % SLOT or proof > SLOT * MAX_SESSIONS):
         raise Refused(Reason.MALFORMED, "a proof of sessions with an impossible length")
     if mode == SESSION and introduction:
         raise Refused(Reason.MALFORMED, "a packet of a session with a credential, which only its beginning has")
@@ -147,19 +151,16 @@ def digest(body: Buffer) -> bytes:
     return b"\1" + hashlib.sha256(b"".join(parts)).digest()
 
 
-def join_batch(payloads: Sequence[Buffer], head: bytes = b"") -> bytes:
+def join_batch(payloads: Sequence[Buffer]) -> bytes:
     """The body of a batch: count, lengths, payloads.
-
-    head: what each payload begins with, not yet in it.
 
     Raises:
         ConfigError: none, or too many.
     """
     if not 0 < len(payloads) <= MAX_BATCH:
         raise ConfigError(f"a batch has 1 to {MAX_BATCH} messages, not {len(payloads)}")
-    begun = len(head)
-    lengths = struct.pack(f">{len(payloads)}I", *[begun + len(payload) for payload in payloads])
-    return b"".join((_COUNT.pack(len(payloads)), lengths, head, head.join(payloads)))
+    lengths = struct.pack(f">{len(payloads)}I", *map(len, payloads))
+    return b"".join((_COUNT.pack(len(payloads)), lengths, *payloads))
 
 
 def split_batch(body: bytes) -> list[bytes]:
@@ -192,6 +193,7 @@ class Opened(NamedTuple):
         epoch: of the key.
         authentic: False only for provisional messages of chain mode that are not confirmed yet.
         stream: 32 bytes, the sender's key id and the salt.
+        label: 16 bytes, as the sender gave them.
     """
 
     payload: bytes
@@ -202,6 +204,7 @@ class Opened(NamedTuple):
     epoch: int
     authentic: bool
     stream: bytes
+    label: bytes = NO_LABEL
 
     @property
     def ident(self) -> bytes:
@@ -209,7 +212,7 @@ class Opened(NamedTuple):
         return self.stream + self.sequence.to_bytes(8, "big")
 
 
-make_opened: Callable[[tuple[bytes, str, int, bytes, int, int, bool, bytes]], Opened] = partial(tuple.__new__, Opened)
+make_opened: Callable[[tuple[bytes, str, int, bytes, int, int, bool, bytes, bytes]], Opened] = partial(tuple.__new__, Opened)
 """`Opened` of all its fields, in two thirds of the time that its own constructor takes."""
 
 _threads: ThreadPoolExecutor | None = None

@@ -23,6 +23,7 @@ from tutelage.sgc.history import History, parse_request
 from tutelage.sgc.packet import anchored
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.sealing import Sealer
+from tutelage.sgc.session import REPLACEMENT
 from tutelage.sgc.transport.base import Congested, Transport
 
 log = logging.getLogger(__name__)
@@ -30,7 +31,11 @@ log = logging.getLogger(__name__)
 _WHOLE = frames.Kind.WHOLE
 
 INLINE = 16 << 10
-"""Bytes of the largest message that is sealed in the caller's thread: so much the system's own buffers always take."""
+"""Bytes of the largest message that is sealed in any caller's thread: so much the system's own buffers always take."""
+
+PATIENT = 5.0
+"""Seconds after which the network gives up a link that takes nothing. Callers who would wait as long for room seal messages
+in one packet in their own thread, too: two changes of threads less."""
 
 SPACING = {Authenticity.SIGNATURE: 0.0004, Authenticity.SESSION: 0.0002, Authenticity.CHAIN: 0.0002}
 """Seconds between packets of a busy publisher. Receivers need 0.05 ms for one, 0.2 ms for a signed one; so they keep up."""
@@ -114,7 +119,8 @@ class Publisher:
         with self._lock:
             if self._closing or self._failure is not None:
                 self._check()
-            alone = now >= self._free_at and not self._busy and size <= INLINE and not self._queue
+            inline = size <= INLINE or (wait >= PATIENT and size <= frames.PIECE)
+            alone = inline and now >= self._free_at and not self._busy and not self._queue
             if alone:
                 self._busy = True
             else:
@@ -204,14 +210,14 @@ class Publisher:
             size, age, seal = len(payload), now - self._born, self._sealer.seal
             if len(batch) > 1:
                 payloads = [payload for payload, _ in batch]
-                packet = self._sealer.seal_many(payloads, head=frames.head(_WHOLE, age), now=sent)
+                packet = self._sealer.seal_many(payloads, label=frames.label(_WHOLE, age), now=sent)
                 self._hand_over(len(batch), packet, now)
                 size = sum(map(len, payloads))
             elif size <= frames.PIECE:
-                self._hand_over(1, seal(frames.head(_WHOLE, age) + payload, now=sent), now)
+                self._hand_over(1, seal(payload, label=frames.label(_WHOLE, age), now=sent), now)
             else:
-                for piece in frames.pieces(memoryview(payload), age):
-                    self._hand_over(1, seal(piece, now=sent), now)
+                for label, piece in frames.pieces(memoryview(payload), age):
+                    self._hand_over(1, seal(piece, label=label, now=sent), now)
             self.sent += len(batch)
             self.bytes += size
         except NoKey:
@@ -292,7 +298,7 @@ class Publisher:
     def _show_life(self) -> None:
         try:
             now = time.monotonic()
-            self._hand_over(1, self._sealer.seal(frames.head(frames.Kind.LIFE, now - self._born)), now)
+            self._hand_over(1, self._sealer.seal(b"", label=frames.label(frames.Kind.LIFE, now - self._born)), now)
         except NoKey:
             self._need_key()
         finally:
@@ -334,6 +340,9 @@ class Publisher:
     def _answer(self, offers: list[bytes]) -> None:
         for offer in offers:
             try:
+                if len(offer) == REPLACEMENT:
+                    self._sealer.end_session(offer)
+                    continue
                 answer = self._sealer.accept_session(offer)
             except Refused as refused:
                 self.refusals.add(refused.reason)

@@ -28,11 +28,14 @@ from tutelage.sgc.packet import (
     MAX_PAYLOAD,
     MAX_SESSIONS,
     MODES,
+    NO_LABEL,
     PROOF,
     SALT_BYTES,
     SESSION,
+    SESSION_ID,
     SIGNATURE,
     SLOT,
+    SOLE,
     TAG,
     VERSION,
     Buffer,
@@ -43,9 +46,9 @@ from tutelage.sgc.packet import (
     message_key,
     nonce,
 )
-from tutelage.sgc.reasons import Refusals, Refused
+from tutelage.sgc.reasons import Reason, Refusals, Refused
 from tutelage.sgc.rules import Lane
-from tutelage.sgc.session import Handshake, Session, tags
+from tutelage.sgc.session import REPLACEMENT, Handshake, Session, tags
 
 log = logging.getLogger(__name__)
 
@@ -108,11 +111,14 @@ class Sealer:
         self._sender = key_id(self._entry.secret, b"sender", self._home.signing_key.public_key())
         self._handshake = Handshake(self._home, self._entry, lane)
         self._cipher: AESGCM | None = None
+        self._key = b""
+        self._sole: AESGCM | None = None  # while there is one session only
 
-    def seal(self, payload: Buffer, *, bind: bytes = b"", now: int | None = None) -> Packet:
+    def seal(self, payload: Buffer, *, label: bytes = NO_LABEL, bind: bytes = b"", now: int | None = None) -> Packet:
         """One message as one packet.
 
         payload: up to `MAX_PAYLOAD` bytes.
+        label: 16 bytes that travel with it in clear, and that nobody can change.
         bind: further bytes that the receiver must name too; not sent. A reply binds to its request's `Opened.ident`.
         now: nanoseconds since 1970; default: the clock.
 
@@ -122,18 +128,18 @@ class Sealer:
             NotAllowed: the policy has changed.
             ConfigError: the payload is too long.
         """
-        return self._seal(_flat(payload) if isinstance(payload, memoryview) else payload, 0, 1, bind, now)
+        return self._seal(_flat(payload) if isinstance(payload, memoryview) else payload, 0, 1, label, bind, now)
 
-    def seal_many(self, payloads: Sequence[Buffer], *, head: bytes = b"", now: int | None = None) -> Packet:
+    def seal_many(self, payloads: Sequence[Buffer], *, label: bytes = NO_LABEL, now: int | None = None) -> Packet:
         """Many small messages as one packet with one proof. `Opener.open_many` gives them back one by one.
 
-        head: what each message begins with, not yet in `payloads`.
+        label: of all of them.
 
         Raises:
             As `seal`.
         """
         parts = [_flat(each) if isinstance(each, memoryview) else each for each in payloads]
-        return self._seal(join_batch(parts, head), BATCH, len(parts), b"", now)
+        return self._seal(join_batch(parts), BATCH, len(parts), label, b"", now)
 
     def introduce(self) -> None:
         """Let the next packet carry this node's credential, as a receiver said that it does not know us."""
@@ -148,7 +154,7 @@ class Sealer:
             now = time.time_ns() if now is None else now
             cipher = self._look(now)
             length = self._link.proof_bytes(with_message=False) + TAG
-            header = self._header(ANCHOR | BARE, self.sequence, 0, length, now)
+            header = self._header(ANCHOR | BARE, self.sequence, 0, length, NO_LABEL, now)
             anchor = self._link.anchor(self._sender, self.salt, self._statements, self._home.signing_key)
             body = cipher.encrypt(nonce(BARE_BODY, header), b"", header)
             return header + body + cipher.encrypt(nonce(BARE_PROOF, header), anchor, header)
@@ -169,14 +175,30 @@ class Sealer:
                 answer, session = self._handshake.answer(offer, self._sender, self.salt)
             same = [one for one in self._sessions if one.member.pseudonym == session.member.pseudonym]
             kept = [one for one in self._sessions if one not in same[:-1]]
-            self._sessions = [*kept, session][-MAX_SESSIONS:]
+            self._open([*kept, session][-MAX_SESSIONS:])
             return answer
+
+    def end_session(self, replacement: bytes) -> None:
+        """Session mode: a receiver has renewed its session, and needs the earlier one no more.
+
+        replacement: from its `Opener.replacements`; one that names no session of ours is for another sender.
+
+        Raises:
+            Refused: not from the other end of the session that it names. Counted.
+        """
+        with self._lock, self.refusals.counting():
+            if len(replacement) != REPLACEMENT:
+                raise Refused(Reason.MALFORMED, f"a replacement of {len(replacement)} bytes")
+            for session in self._sessions:
+                if session.ident == replacement[:SESSION_ID]:
+                    old, who = session.replaces(replacement), session.member.pseudonym
+                    self._open([one for one in self._sessions if one.ident != old or one.member.pseudonym != who])
 
     def receivers(self) -> list[str]:
         """Session mode: names of the nodes with a session."""
         return sorted({session.member.node for session in self._sessions})
 
-    def _seal(self, body: Buffer, flags: int, count: int, bind: bytes, now: int | None) -> Packet:
+    def _seal(self, body: Buffer, flags: int, count: int, label: bytes, bind: bytes, now: int | None) -> Packet:
         if len(body) > MAX_PAYLOAD + 4 * (count + 1):
             raise ConfigError(f"a message of {len(body)} bytes for {self.alias}; {MAX_PAYLOAD} fit: split or compress it")
         with self._lock:
@@ -185,7 +207,9 @@ class Sealer:
             first = self.sequence + 1
             self.sequence += count
             introduction, introduced = b"", 0
-            if self._mode == SESSION:
+            if self._sole is not None:
+                cipher, flags, proof = self._sole, flags | SOLE, SESSION_ID
+            elif self._mode == SESSION:
                 proof = SLOT * len(self._sessions)
             else:
                 if not 0 < self._introduce_at - now <= self._introduce_every:
@@ -195,7 +219,7 @@ class Sealer:
                 if self._mode == CHAIN and self._link.due(now):
                     flags |= ANCHOR
                 proof = self._proof_bytes(flags)
-            header = self._header(flags, first, introduced, proof, now)
+            header = self._header(flags, first, introduced, proof, label, now)
             if not introduced and len(body) <= _SMALL:
                 sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind)
                 return sealed + self._proof(cipher, header, bind, body, flags, first, sealed, now)
@@ -220,7 +244,7 @@ class Sealer:
         self, cipher: AESGCM, header: bytes, bind: bytes, body: Buffer, flags: int, first: int, sealed: Buffer, now: int
     ) -> bytes:
         if self._mode == SESSION:
-            return tags(self._sessions, header, sealed, bind)
+            return self._sessions[0].ident if flags & SOLE else tags(self._sessions, header, sealed, bind)
         statement = self._statements.message(header, bind, body)
         key = self._home.signing_key
         # A signature is sealed too: in clear, anyone who knows a node's certificate could tell which packets are its own.
@@ -232,8 +256,10 @@ class Sealer:
         anchor = self._link.anchor(self._sender, self.salt, self._statements, key)
         return cipher.encrypt(nonce(PROOF, header), anchor, header)
 
-    def _header(self, flags: int, first: int, introduction: int, proof: int, now: int) -> bytes:
-        return make_header(VERSION, self._mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now)
+    def _header(self, flags: int, first: int, introduction: int, proof: int, label: bytes, now: int) -> bytes:
+        return make_header(
+            VERSION, self._mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now, label
+        )
 
     def _look(self, now: int) -> AESGCM:
         """The cipher to use now. Looks from time to time, and at every change, whether this node may still send."""
@@ -251,11 +277,18 @@ class Sealer:
             raise NotAllowed(f"the policy changed the metadata or authenticity of {self.alias}; open it again")
         epoch = self._keyring.sealing(self.alias, seconds)
         if epoch.number != self._epoch or self._cipher is None:
-            key = message_key(epoch.key, self._name, self.lane, epoch.number, self._sender, self.salt)
-            self._cipher, self._epoch = AESGCM(key), epoch.number
-        self._sessions = [session for session in self._sessions if self._alive(session, now)]
+            self._key = message_key(epoch.key, self._name, self.lane, epoch.number, self._sender, self.salt)
+            self._cipher, self._epoch, self._sole = AESGCM(self._key), epoch.number, None
+        alive = [session for session in self._sessions if self._alive(session, now)]
+        if alive != self._sessions or self._sole is None:
+            self._open(alive)
         self._versions, self._looked, self._look_at = versions, now, now + _LOOK_EVERY
         return self._cipher
+
+    def _open(self, sessions: list[Session]) -> None:
+        """These are open from now on."""
+        self._sessions = sessions
+        self._sole = sessions[0].sole(self._key) if len(sessions) == 1 and self._key else None
 
     def _alive(self, session: Session, now: int) -> bool:
         try:

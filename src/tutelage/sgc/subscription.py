@@ -283,6 +283,8 @@ class Subscription:
                 self.opener.complete_session(item.packet)
             except Refused:
                 return  # counted by the opener; most answers are for others
+            for replacement in self.opener.replacements():
+                self._transport.publish(lanes.key(self._entry.name, lanes.OFFER), replacement)
         else:
             held, self._held = self._held, deque(maxlen=HELD_PACKETS)
             for received, packet in held:
