@@ -99,6 +99,8 @@ class Delivery(ABC):
         self.tally = Tally()
         self.twice: set[str] = set()
         """Senders of which two programs send at once: only the one that began later is heard."""
+        self.gapped: dict[str, Stream] = {}
+        """Streams with a gap, by sender."""
         self._current: dict[str, Stream] = {}
         self._past: deque[bytes] = deque(maxlen=256)  # salts of earlier starts
 
@@ -167,10 +169,6 @@ class Delivery(ABC):
 class InOrder(Delivery):
     """Every message, in order. What is missing is asked for, and given up only when the publisher cannot give it."""
 
-    def __init__(self, started: float, patience: float = PATIENCE, *, from_first_heard: bool = False) -> None:
-        super().__init__(started, patience, from_first_heard=from_first_heard)
-        self._gapped: dict[str, Stream] = {}  # those with a gap, by sender
-
     def accept_all(self, messages: list[Opened], now: float) -> list[Opened]:
         first, count = messages[0], len(messages)
         known = self._current.get(first.sender)
@@ -203,13 +201,13 @@ class InOrder(Delivery):
 
     @property
     def crowded(self) -> bool:
-        return bool(self._gapped) and any(
-            len(stream.held) > HELD_MESSAGES // 2 or stream.size > HELD_BYTES // 2 for stream in tuple(self._gapped.values())
+        return bool(self.gapped) and any(
+            len(stream.held) > HELD_MESSAGES // 2 or stream.size > HELD_BYTES // 2 for stream in tuple(self.gapped.values())
         )
 
     def due(self, now: float) -> list[Opened]:
         ready: list[Opened] = []
-        for stream in tuple(self._gapped.values()):
+        for stream in tuple(self.gapped.values()):
             if stream.since is not None and now - stream.since >= stream.patience:
                 stream.patience = min(stream.patience, IMPATIENCE)
                 ready += self._release_all(stream, now)
@@ -217,7 +215,7 @@ class InOrder(Delivery):
 
     def questions(self, now: float) -> list[tuple[bytes, list[tuple[int, int]]]]:
         asked = []
-        for stream in self._gapped.values():
+        for stream in self.gapped.values():
             if now >= stream.ask_at:
                 stream.asked, stream.ask_at = stream.next, now + PATIENCE  # until `answered`
                 asked.append((stream.salt, _gaps(stream)))
@@ -225,7 +223,7 @@ class InOrder(Delivery):
 
     def answered(self, salt: bytes, floor: int, now: float, *, in_vain: bool = False) -> list[Opened]:
         ready: list[Opened] = []
-        for stream in tuple(self._gapped.values()):
+        for stream in tuple(self.gapped.values()):
             if stream.salt == salt:
                 if in_vain and stream.next == stream.asked:
                     floor = min(stream.held)
@@ -238,18 +236,18 @@ class InOrder(Delivery):
         return ready
 
     def wake(self) -> float | None:
-        if not self._gapped:
+        if not self.gapped:
             return None
-        waiting = [(stream, stream.since) for stream in tuple(self._gapped.values())]
+        waiting = [(stream, stream.since) for stream in tuple(self.gapped.values())]
         return min((min(s.ask_at, since + s.patience) for s, since in waiting if since is not None), default=None)
 
     def _wait(self, stream: Stream, since: float | None) -> None:
         """A stream has a gap and no progress since then; None: it has none any more."""
         stream.since = since
         if since is not None:
-            self._gapped[stream.sender] = stream
+            self.gapped[stream.sender] = stream
         else:
-            self._gapped.pop(stream.sender, None)
+            self.gapped.pop(stream.sender, None)
 
     def _advance(self, stream: Stream, now: float) -> list[Opened]:
         """What is next in turn among those held."""

@@ -33,6 +33,7 @@ from tutelage.sgc.packet import (
     SOLE,
     TAG,
     Buffer,
+    Layout,
     Opened,
     Statements,
     make_opened,
@@ -93,6 +94,7 @@ class Opener:
         self._looked = self._look_at = 0
         self._versions = (-1, -1)
         self._look_count = 0
+        self._layout: tuple[bytes, Layout] = b"", Layout(0, 0, 0)
         self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
         self._members: OrderedDict[bytes, Member] = OrderedDict()
         self._sessions: OrderedDict[bytes, Session] = OrderedDict()  # by sender, salt and id
@@ -168,7 +170,10 @@ class Opener:
             raise Refused(Reason.MALFORMED, f"a packet of {size} bytes")
         raw = bytes(packet[:HEADER])
         layout, name, first, sent, label = read_header(raw)
-        flags, introduction, proof = read_layout(layout, self._mode)
+        known = self._layout
+        if layout != known[0]:  # most packets begin alike
+            known = self._layout = layout, read_layout(layout, self._mode)
+        flags, introduction, proof = known[1]
         start, end = HEADER + introduction, size - proof
         if first == 0 or start + TAG > end:
             raise Refused(Reason.MALFORMED, "a packet with an impossible header")
@@ -183,13 +188,14 @@ class Opener:
             _decrypt(stream.cipher, BARE_BODY, packet[start:end], raw)
             member = self._member(stream, raw, packet[HEADER:start], now)
             return self._anchor(stream, BARE_PROOF, raw, packet[end:], member, now)
+        about = raw + bind if bind else raw
         if flags & SOLE:
-            session = self._session(stream, packet[end:], now)
-            if session is None:
-                raise self._no_session()
-            body, member = _decrypt(stream.sole_cipher(session), BODY, packet[start:end], raw + bind), session.member
+            sole = stream.sole
+            if sole is None or sole[0].ident != packet[end:] or sole[0].member is not stream.member or now >= sole[0].until:
+                sole = self._sole(stream, packet[end:], now)
+            body, member = _decrypt(sole[1], BODY, packet[start:end], about), sole[0].member
         else:
-            body = _decrypt(stream.cipher, BODY, packet[start:end], raw + bind)
+            body = _decrypt(stream.cipher, BODY, packet[start:end], about)
             if self._mode == SESSION:
                 member = self._session_member(stream, raw, packet, end, bind, now)
             else:
@@ -301,6 +307,16 @@ class Opener:
                 return session.member
         raise self._no_session()
 
+    def _sole(self, stream: _Stream, ident: Buffer, now: int) -> tuple[Session, AESGCM]:
+        """The session that a packet is sealed for alone, and the cipher; the stream keeps them."""
+        session = self._session(stream, ident, now)
+        if session is None:
+            raise self._no_session()
+        sole = stream.sole
+        if sole is None or sole[0] is not session:
+            sole = stream.sole = session, session.sole(stream.key)
+        return sole
+
     def _session(self, stream: _Stream, ident: Buffer, now: int) -> Session | None:
         """The open session with this id, with a sender who may send, now."""
         session = self._sessions.get(stream.start + ident)
@@ -345,9 +361,10 @@ class _Stream:
         key, cipher: of its packets; not there before the first look.
         look: when it was last checked, in looks.
         member: who it is; None before the first authentic packet.
+        sole: the session that packets of the stream were last sealed for alone, and its cipher.
     """
 
-    __slots__ = ("_sole", "cipher", "epoch", "key", "look", "member", "name", "salt", "sender", "start")
+    __slots__ = ("cipher", "epoch", "key", "look", "member", "name", "salt", "sender", "sole", "start")
 
     key: bytes
     cipher: AESGCM
@@ -358,14 +375,7 @@ class _Stream:
         self.start: bytes = self.sender + self.salt
         self.look = _NEVER
         self.member: Member | None = None
-        self._sole: tuple[Session, AESGCM] | None = None
-
-    def sole_cipher(self, session: Session) -> AESGCM:
-        """Of packets that are sealed for one session alone."""
-        sole = self._sole
-        if sole is None or sole[0] is not session:
-            sole = self._sole = session, session.sole(self.key)
-        return sole[1]
+        self.sole: tuple[Session, AESGCM] | None = None
 
 
 def _decrypt(cipher: AESGCM, purpose: bytes, sealed: Buffer, associated: bytes) -> bytes:

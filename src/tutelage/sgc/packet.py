@@ -17,7 +17,7 @@ import os
 import struct
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
+from functools import partial
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -82,9 +82,8 @@ read_stream = _STREAM.unpack
 """Epoch, sender and salt."""
 
 
-@lru_cache(256)
 def read_layout(start: bytes, mode: int) -> Layout:
-    """Read the layout of a packet, if it is one of ours of this mode. Most packets begin alike.
+    """Read the layout of a packet, if it is one of ours of this mode.
 
     Raises:
         Refused: MALFORMED or WRONG_MODE.

@@ -126,7 +126,7 @@ class Publisher:
             else:
                 self._enqueue(bytes(payload), sent, wait)
         if alone:
-            self._ship([(bytes(payload), sent)], now)
+            self._ship([(payload if type(payload) is bytes else bytes(payload), sent)], now)
 
     def flush(self, timeout: float) -> bool:
         """Wait until everything queued has been handed to the transport; False: it was not within `timeout` seconds."""

@@ -154,7 +154,9 @@ class Sealer:
             now = time.time_ns() if now is None else now
             cipher = self._look(now)
             length = self._link.proof_bytes(with_message=False) + TAG
-            header = self._header(ANCHOR | BARE, self.sequence, 0, length, NO_LABEL, now)
+            header = make_header(
+                VERSION, CHAIN, ANCHOR | BARE, 0, length, self._epoch, self._sender, self.salt, self.sequence, now, NO_LABEL
+            )
             anchor = self._link.anchor(self._sender, self.salt, self._statements, self._home.signing_key)
             body = cipher.encrypt(nonce(BARE_BODY, header), b"", header)
             return header + body + cipher.encrypt(nonce(BARE_PROOF, header), anchor, header)
@@ -203,12 +205,12 @@ class Sealer:
             raise ConfigError(f"a message of {len(body)} bytes for {self.alias}; {MAX_PAYLOAD} fit: split or compress it")
         with self._lock:
             now = time.time_ns() if now is None else now
-            cipher = self._look(now)
+            cipher, sole = self._look(now), self._sole
             first = self.sequence + 1
             self.sequence += count
             introduction, introduced = b"", 0
-            if self._sole is not None:
-                cipher, flags, proof = self._sole, flags | SOLE, SESSION_ID
+            if sole is not None:
+                cipher, flags, proof = sole, flags | SOLE, SESSION_ID
             elif self._mode == SESSION:
                 proof = SLOT * len(self._sessions)
             else:
@@ -219,9 +221,14 @@ class Sealer:
                 if self._mode == CHAIN and self._link.due(now):
                     flags |= ANCHOR
                 proof = self._proof_bytes(flags)
-            header = self._header(flags, first, introduced, proof, label, now)
+            header = make_header(
+                VERSION, self._mode, flags, introduced, proof, self._epoch, self._sender, self.salt, first, now, label
+            )
             if not introduced and len(body) <= _SMALL:
-                sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind)
+                sealed = cipher.encrypt(nonce(BODY, header), body, header + bind if bind else header)
+                if sole is not None:
+                    return b"".join((header, sealed, self._sessions[0].ident))
+                sealed = header + sealed
                 return sealed + self._proof(cipher, header, bind, body, flags, first, sealed, now)
             # Written in place, at its full length from the beginning: every copy of a large message counts.
             start = HEADER + introduced
@@ -255,11 +262,6 @@ class Sealer:
             return b""
         anchor = self._link.anchor(self._sender, self.salt, self._statements, key)
         return cipher.encrypt(nonce(PROOF, header), anchor, header)
-
-    def _header(self, flags: int, first: int, introduction: int, proof: int, label: bytes, now: int) -> bytes:
-        return make_header(
-            VERSION, self._mode, flags, introduction, proof, self._epoch, self._sender, self.salt, first, now, label
-        )
 
     def _look(self, now: int) -> AESGCM:
         """The cipher to use now. Looks from time to time, and at every change, whether this node may still send."""

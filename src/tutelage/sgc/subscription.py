@@ -192,15 +192,15 @@ class Subscription:
     def _on_packet(self, packet: bytes) -> None:
         if self.outlet.closed:
             return
-        if self._direct and self._inbox.empty() and not self.delivery.crowded and self._turn.acquire(blocking=False):
+        if self._direct and self._inbox.empty() and not self.delivery.gapped and self._turn.acquire(False):
             try:
                 now = time.time_ns()
-                self.outlet.give(self._take(now * 1e-9, packet, now))
+                self._take(now * 1e-9, packet, now)
             except Exception:
                 log.exception("subscription of %s", self.alias)
             finally:
                 self._turn.release()
-            if self.delivery.wake() is not None:
+            if self.delivery.gapped:
                 self._look_again()  # our thread sees to the gap
             return
         with self._lock:
@@ -264,7 +264,7 @@ class Subscription:
         received, refused = time.time(), 0
         for late in repair.packets:
             before = self.packets
-            self.outlet.give(self._take(received, late))
+            self._take(received, late)
             self.repaired += self.packets > before
             refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
         ready = self.delivery.answered(repair.salt, repair.floor, time.monotonic(), in_vain=refused > 0)
@@ -275,9 +275,9 @@ class Subscription:
             with self._lock:
                 self._inbox_bytes -= len(item[1])
             if self._lossy:
-                self._pass_on_newest(self._take(*item))
+                self._take_newest(item)
             else:
-                self.outlet.give(self._take(*item))
+                self._take(*item)
         elif isinstance(item, _Answer):
             try:
                 self.opener.complete_session(item.packet)
@@ -288,23 +288,25 @@ class Subscription:
         else:
             held, self._held = self._held, deque(maxlen=HELD_PACKETS)
             for received, packet in held:
-                self.outlet.give(self._take(received, packet))
+                self._take(received, packet)
 
-    def _take(self, received: float, packet: bytes | memoryview, now: int | None = None) -> list[Message]:
-        """Open a packet; the messages that it completes. received: seconds since 1970; now: nanoseconds, None: the clock."""
+    def _take(self, received: float, packet: bytes | memoryview, now: int | None = None) -> None:
+        """Open a packet, and give the messages that it completes. received: seconds since 1970; now: nanoseconds, None: the
+        clock."""
+        opened = self._open(received, packet, now)
+        if opened:
+            ready = self.delivery.accept_all(opened, time.monotonic())
+            self.outlet.give(self._assembler.messages(ready, received))
+            self._heard(opened[-1], received)
+
+    def _open(self, received: float, packet: bytes | memoryview, now: int | None = None) -> list[Opened]:
         try:
             opened = self.opener.open_many(packet, now=now)
         except Refused as refused:
             self._refused(refused.reason, received, packet)
             return []
         self.packets += 1
-        if not opened:
-            return []
-        self._heard(opened[-1], received)
-        ready = self.delivery.accept_all(opened, time.monotonic())
-        if len(self.delivery.twice) > len(self._twice):
-            self._say_twice()
-        return self._assembler.messages(ready, received)
+        return opened
 
     def _say_twice(self) -> None:
         for sender in sorted(self.delivery.twice - self._twice):
@@ -322,6 +324,8 @@ class Subscription:
         self.latency[sender] = took if before is None else before + 0.1 * (took - before)
         if before is None and self._held:
             self._look_again()  # those that waited for the introduction of this sender
+        if len(self.delivery.twice) > len(self._twice):
+            self._say_twice()
 
     def _refused(self, reason: Reason, received: float, packet: bytes | memoryview) -> None:
         self._last_refusal = reason
@@ -361,22 +365,27 @@ class Subscription:
 
     # -- to the application ------------------------------------------------------------------------------------------------
 
-    def _pass_on_newest(self, messages: list[Message]) -> None:
+    def _take_newest(self, first: tuple[float, bytes]) -> None:
         """Lossy: everything that is there already is opened first; the application gets the newest."""
-        newest = deque(messages, maxlen=self._limit)
-        count = len(messages)
-        while True:
+        newest: deque[Message] = deque(maxlen=self._limit)
+        count = 0
+        item: tuple[float, bytes] | _Answer | _Retry | None = first
+        while isinstance(item, tuple):
+            received, packet = item
+            opened = self._open(received, packet)
+            if opened:
+                self._heard(opened[-1], received)
+                more = self._assembler.messages(self.delivery.accept_all(opened, time.monotonic()), received)
+                newest += more
+                count += len(more)
             try:
                 item = self._inbox.get_nowait()
             except queues.Empty:
                 break
-            if not isinstance(item, tuple):
+            if isinstance(item, tuple):
+                with self._lock:
+                    self._inbox_bytes -= len(item[1])
+            else:
                 self._inbox.put(item)
-                break
-            with self._lock:
-                self._inbox_bytes -= len(item[1])
-            more = self._take(*item)
-            newest += more
-            count += len(more)
         self.outlet.superseded += count - len(newest)
         self.outlet.give(list(newest))
