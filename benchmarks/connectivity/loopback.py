@@ -18,8 +18,8 @@ TRIPS = {"64 B": 100, "8 KB": 60, "256 KB": 20, "14 MB": 3}
 """In a round; a quarter of them for chains, whose lone messages wait for their anchors."""
 
 WARM_UP = 300
-"""Round trips of 256 KB before the first round: by then a publisher's history is full (64 MiB), as it is in all but the first
-moments of its life, and no message has to wait for the system to find new memory."""
+"""Round trips of 256 KB before the first round: by then a publisher's history is full (64 MiB), as it is in all but the
+first moments of its life, and no message has to wait for the system to find new memory."""
 
 
 def measure(quick: bool = False, stacks: tuple[str, ...] = STACKS) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from tutelage.sgc.messages import Message
 from tutelage.sgc.node import Node
 from tutelage.sgc.publisher import PATIENT
 from tutelage.sgc.service import RequestFailed
-from tutelage.sgc.transport.base import Congested, NoReply
+from tutelage.sgc.transport.base import Congested, NoReply, lent
 from tutelage.sgc.transport.memory import MemoryTransport, Network
 
 MODES = ("signature", "session", "chain")
@@ -143,6 +143,25 @@ def test_a_patient_caller_sends_large_messages_itself(network: Network, arm: Nod
         log.send(bytes(PIECE), wait=wait)
         assert log.flush(5.0)
     assert threads == [threading.current_thread().name, "sgc-publish-log-signature"]
+
+
+def test_a_direct_callback_does_not_wait_for_the_network(network: Network, arm: Node, server: Node) -> None:
+    """It has a thread of the network, which goes on receiving only when the callback is done."""
+    log, there = arm.publisher("log-signature"), threading.get_ident()
+    inside: list[bool] = []
+    server.subscribe("log-signature", lambda message: inside.append(there in lent), direct=True)
+    eventually(lambda: log.send(b"?") or True in inside, every=0.05)
+    assert there not in lent
+    threads: list[str] = []
+    network.tap = lambda key, packet: threads.append(threading.current_thread().name) or []
+    eventually(lambda: not log._busy and time.monotonic() > log._free_at)
+    lent.add(there)
+    try:
+        log.send(bytes(PIECE), wait=PATIENT)
+    finally:
+        lent.discard(there)
+    assert log.flush(5.0)
+    assert threads == ["sgc-publish-log-signature"]
 
 
 def test_iterating_over_a_subscription(arm: Node, server: Node) -> None:

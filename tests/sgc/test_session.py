@@ -288,3 +288,41 @@ def test_an_expired_session_of_a_packet_does_not_hide_the_one_that_is_open(fleet
     first = next(iter(opener._sessions))
     opener._sessions[first] = replace(opener._sessions[first], until=0)
     assert opener.open(sealer.seal(b"x")).payload == b"x"
+
+
+def test_a_repeated_answer_ends_nothing(fleet: Fleet) -> None:
+    """The network may deliver twice, and a router may at will."""
+    sealer, opener = fleet.sealer("operator-1", "teleop"), fleet.opener("server", "teleop")
+    answers = [sealer.accept_session(opener.offer_session()) for _ in range(2)]
+    opener.complete_session(answers[0])
+    opener.complete_session(answers[0])
+    assert opener.replacements() == []
+    opener.complete_session(answers[1])
+    (replacement,) = opener.replacements()
+    sealer.end_session(replacement)
+    for answer in answers:
+        assert opener.complete_session(answer) == "operator-1"
+    assert opener.replacements() == []
+    assert opener.open(sealer.seal(b"x")).payload == b"x"
+    (session,) = sealer._sessions
+    sealer.end_session(session.replacing(session.ident))
+    assert sealer._sessions == [session]
+
+
+def test_a_session_under_a_new_certificate_outlives_the_old_one(tmp_path) -> None:
+    """Also if nothing was opened under it before the old certificate ended."""
+    fleet = Fleet(tmp_path, ["drone-1", "server"], share=False)
+    home = fleet.join("operator-1", hours=0.3)
+    fleet.share()
+    sealer, opener = fleet.pair("teleop", "operator-1", "server")
+    opener.open(sealer.seal(b"x"))
+    home.accept(fleet.authority.issue(home.request(), hours=24))
+    meet(sealer, opener)
+    later = time.time_ns() + round(0.4 * 3600e9)
+    assert opener.open(sealer.seal(b"y", now=later), now=later).payload == b"y"
+
+
+def test_a_session_does_not_print_its_secret(fleet: Fleet) -> None:
+    sealer, _ = fleet.pair("teleop", "operator-1", "server")
+    (session,) = sealer._sessions
+    assert repr(session.secret) not in repr(session)

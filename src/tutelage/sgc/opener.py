@@ -24,6 +24,7 @@ from tutelage.sgc.packet import (
     HEADER,
     INTRODUCTION,
     MAX_PACKET,
+    MAX_SESSIONS,
     MODES,
     PROOF,
     SESSION,
@@ -146,8 +147,10 @@ class Opener:
             with self.refusals.counting():
                 sender, salt, session = self._handshake.complete(answer)
             start = sender + salt
+            if start + session.ident in self._sessions:  # the network may repeat an answer
+                return session.member.node
             earlier = [one.ident for key, one in self._sessions.items() if key.startswith(start)]
-            self._replacements += map(session.replacing, earlier[-1:])
+            self._replacements = [*self._replacements, *map(session.replacing, earlier[-1:])][-MAX_SESSIONS:]
             self._sessions[start + session.ident] = session
             while len(self._sessions) > _MAX_SESSIONS:
                 self._sessions.popitem(last=False)
@@ -258,7 +261,8 @@ class Opener:
         """Is its epoch accepted, may its sender still send? To be asked after each look.
 
         A packet with a credential answers for itself alone, in `_member`: the credential may be newer than the one known, or
-        that of somebody who was revoked. The next packet without one is looked at anew.
+        that of somebody who was revoked. The next packet without one is looked at anew. In session mode the next packet's
+        session says who the sender is: one that is renewed may have another certificate than the one known.
         """
         key = self._keyring.opening(self.alias, stream.epoch, now / 1e9).key
         if stream.look == _NEVER:
@@ -266,7 +270,9 @@ class Opener:
             stream.cipher = AESGCM(stream.key)
         if introduced:
             return
-        if stream.member is not None:
+        if self._mode == SESSION:
+            stream.member = None
+        elif stream.member is not None:
             self._check(stream.member, now)
         stream.look = self._look_count
 

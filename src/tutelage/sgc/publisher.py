@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from threading import get_ident
 from types import TracebackType
 from typing import Self
 
@@ -24,7 +25,7 @@ from tutelage.sgc.packet import anchored
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.sealing import Sealer
 from tutelage.sgc.session import REPLACEMENT
-from tutelage.sgc.transport.base import Congested, Transport
+from tutelage.sgc.transport.base import Congested, Transport, lent
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,8 @@ INLINE = 16 << 10
 
 PATIENT = 5.0
 """Seconds after which the network gives up a link that takes nothing. Callers who would wait as long for room seal messages
-in one packet in their own thread, too: two changes of threads less."""
+in one packet in their own thread, too: two changes of threads less. Not in a direct callback: two nodes whose receiving
+threads wait to send would hold up each other."""
 
 SPACING = {Authenticity.SIGNATURE: 0.0004, Authenticity.SESSION: 0.0002, Authenticity.CHAIN: 0.0002}
 """Seconds between packets of a busy publisher. Receivers need 0.05 ms for one, 0.2 ms for a signed one; so they keep up."""
@@ -105,7 +107,8 @@ class Publisher:
         Without the topic's key, messages wait in the queue until the owner has sent it. Lossy topics: a message that is
         still queued when the next one comes is replaced.
 
-        wait: seconds to wait for room if the queue is full.
+        wait: seconds to wait for room if the queue is full; with `PATIENT` or more, a message that fits into one packet is
+            sent in this thread.
 
         Raises:
             Congested: reliable topics: the queue is full, as the network is slower than the sender. Nothing was queued.
@@ -119,7 +122,7 @@ class Publisher:
         with self._lock:
             if self._closing or self._failure is not None:
                 self._check()
-            inline = size <= INLINE or (wait >= PATIENT and size <= frames.PIECE)
+            inline = size <= INLINE or (wait >= PATIENT and size <= frames.PIECE and get_ident() not in lent)
             alone = inline and now >= self._free_at and not self._busy and not self._queue
             if alone:
                 self._busy = True
@@ -338,6 +341,7 @@ class Publisher:
             self._changed.notify_all()
 
     def _answer(self, offers: list[bytes]) -> None:
+        answered = False
         for offer in offers:
             try:
                 if len(offer) == REPLACEMENT:
@@ -350,8 +354,10 @@ class Publisher:
                 self._need_key()
             else:
                 self._transport.publish(self._answer_key, answer)
-        with self._changed:
-            self._life_at = time.monotonic()
+                answered = True
+        if answered:
+            with self._changed:
+                self._life_at = time.monotonic()
 
     def _replay(self, request: bytes) -> bytes | None:
         """Somebody missed something. Whoever is so far behind that it will soon be gone is waited for, while it catches up;

@@ -194,7 +194,8 @@ class Sealer:
             for session in self._sessions:
                 if session.ident == replacement[:SESSION_ID]:
                     old, who = session.replaces(replacement), session.member.pseudonym
-                    self._open([one for one in self._sessions if one.ident != old or one.member.pseudonym != who])
+                    others = [one for one in self._sessions if one.ident != old or one.member.pseudonym != who]
+                    self._open(others if session in others else self._sessions)
 
     def receivers(self) -> list[str]:
         """Session mode: names of the nodes with a session."""

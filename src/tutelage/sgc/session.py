@@ -13,7 +13,7 @@ import hashlib
 import secrets
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
@@ -54,7 +54,7 @@ class Session:
     member: Member
     until: int
     cipher: AESGCM
-    secret: bytes
+    secret: bytes = field(repr=False)
 
     def sole(self, key: bytes) -> AESGCM:
         """The cipher of packets for this session alone. It takes both secrets: the session's, which proves the sender, and

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from threading import get_ident
 from types import TracebackType
 from typing import Self
 
@@ -25,7 +26,7 @@ from tutelage.sgc.outlet import Outlet
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.repairs import Repair, Repairs
 from tutelage.sgc.sealing import Opened, Opener
-from tutelage.sgc.transport.base import Transport
+from tutelage.sgc.transport.base import Transport, lent
 from tutelage.sgc.workers import Workers
 
 log = logging.getLogger(__name__)
@@ -193,12 +194,15 @@ class Subscription:
         if self.outlet.closed:
             return
         if self._direct and self._inbox.empty() and not self.delivery.gapped and self._turn.acquire(False):
+            thread = get_ident()
+            lent.add(thread)
             try:
                 now = time.time_ns()
                 self._take(now * 1e-9, packet, now)
             except Exception:
                 log.exception("subscription of %s", self.alias)
             finally:
+                lent.discard(thread)
                 self._turn.release()
             if self.delivery.gapped:
                 self._look_again()  # our thread sees to the gap

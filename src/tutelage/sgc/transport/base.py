@@ -22,6 +22,10 @@ _KEY = re.compile(r"[A-Za-z0-9-]+(/[A-Za-z0-9-]+)*\Z")
 _PATTERN = re.compile(r"(\*|[A-Za-z0-9-]+)(/(\*|[A-Za-z0-9-]+))*\Z")
 
 
+lent: set[int] = set()
+"""Threads of a transport, by identifier, that an application's callback has for the moment: they must not wait to send."""
+
+
 class Congested(TutelageError):
     """The queue towards the network is full: the network is slower than the sender. Nothing was sent; try again later."""
 
