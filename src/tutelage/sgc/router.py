@@ -24,6 +24,7 @@ from tutelage.sgc.diagnosis import answer
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.renewal import Renewer
+from tutelage.sgc.roll import EVERYBODY, Roll
 from tutelage.sgc.transport.base import NoReply
 from tutelage.sgc.transport.config import Endpoint, Identity, Timers, import_zenoh, zenoh_config, zenoh_settings
 from tutelage.sgc.transport.tunnel import TunnelServer
@@ -80,6 +81,7 @@ class Router:
         self.refusals = Refusals()
         self._zenoh = import_zenoh()
         self._session: zenoh.Session | None = None
+        self._roll: Roll | None = None
         self._identity = Identity(home.root_file, home.leaf_file, home.key_file)
         self._listen = [each for each in config.listen if each.protocol in ("tls", "quic")]
         if len(self._listen) < len(config.listen):
@@ -166,11 +168,27 @@ class Router:
         session.declare_subscriber(deny, self._zenoh.handlers.Callback(self._on_deny, indirect=True))
         rules = lanes.key(self.home.access.control, lanes.RULES)
         session.declare_queryable(rules, self._zenoh.handlers.Callback(self._on_rules, indirect=True))
+        self._keep_roll(session)
+
+    def _keep_roll(self, session: zenoh.Session) -> None:
+        """Follow who is present, and answer for it."""
+        roll = self._roll = Roll()
+
+        def changed(sample: zenoh.Sample) -> None:
+            roll.changed(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+
+        direct = self._zenoh.handlers.Callback(changed, indirect=False)
+        session.liveliness().declare_subscriber(EVERYBODY, direct, history=True)
+        asked = self._zenoh.handlers.Callback(roll.asked, indirect=False)
+        session.declare_queryable(EVERYBODY, asked, complete=True)  # complete: in a mesh, the nearest router answers
 
     def _end(self) -> None:
         for tunnel in self._tunnels:
             tunnel.close()
         self._tunnels.clear()
+        roll, self._roll = self._roll, None
+        if roll is not None:
+            roll.close()
         session, self._session = self._session, None
         if session is not None:
             session.close()
