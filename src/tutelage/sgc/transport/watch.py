@@ -11,6 +11,7 @@ keeps a roll. The subscription is declared before the question is sent, and rout
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from tutelage.sgc.roll import read
 
 if TYPE_CHECKING:
     import zenoh
+
+log = logging.getLogger(__name__)
 
 PATIENCE = 10.0
 """Seconds for an answer, and for all that follow it."""
@@ -53,7 +56,8 @@ class Watch:
         self._telling = False
         self._names, _, last = key.rpartition("/")
         ask = last == "*" and "*" not in self._names
-        self._subscriber = self._subscribe(history=not ask)
+        self._whole = not ask
+        self._subscribers = [self._subscribe(self._whole)]
         if ask:
             handler = library.handlers.Callback(self._replied, self._asked, indirect=False)
             with contextlib.suppress(library.ZError):  # the session has closed: the next one begins anew
@@ -72,12 +76,19 @@ class Watch:
         with self._lock:
             self._ended = True
             self._changes.clear()
-            subscriber = self._subscriber
-        subscriber.undeclare()
+            subscribers = list(self._subscribers)
+        for each in subscribers:
+            each.undeclare()
 
-    def _subscribe(self, history: bool) -> Any:
-        handler = self._zenoh.handlers.Callback(self._changed, indirect=False)
-        return self._session.liveliness().declare_subscriber(self._key, handler, history=history)
+    def _subscribe(self, whole: bool) -> Any:
+        """whole: with those who are there already."""
+
+        def changed(sample: zenoh.Sample) -> None:
+            if whole or not self._whole:
+                self._changed(sample)
+
+        handler = self._zenoh.handlers.Callback(changed, indirect=False)
+        return self._session.liveliness().declare_subscriber(self._key, handler, history=whole)
 
     def _changed(self, sample: zenoh.Sample) -> None:
         key, present = str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT
@@ -111,17 +122,20 @@ class Watch:
             self._heard.clear()
             done = self._answered or self._ended
         if not done:
+            log.debug("no router has a roll for %s", self._key)
             self._later(self._fall_back)
 
     def _fall_back(self) -> None:
         """No router keeps a roll, or none can be reached now: Zenoh shall tell who is there, now or when one is reached."""
         with contextlib.suppress(self._zenoh.ZError):  # the session has closed: the next one begins anew
-            fresh = self._subscribe(history=True)
+            fresh = self._subscribe(whole=True)
             with self._lock:
-                spare = fresh if self._ended else self._subscriber
-                if not self._ended:
-                    self._subscriber = fresh
-            spare.undeclare()
+                # The first one stays, and tells no more: Zenoh would take leave of both at the router with one of them.
+                self._whole = True
+                self._subscribers.append(fresh)
+                ended = self._ended
+            if ended:
+                fresh.undeclare()
 
     def _tell(self) -> None:
         """Tell what has changed, in order, though threads may meet here; without the lock, as listeners do as they like."""
