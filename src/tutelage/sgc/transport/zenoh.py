@@ -239,7 +239,7 @@ class ZenohTransport(Transport):
             self._publishers = {}
 
     def _follow(self, session: zenoh.Session, number: int) -> None:
-        """Tell the watches when the session, the so-and-so-manieth, loses its router; it looks for another by itself."""
+        """Tell the watches when this session loses its router; it looks for another by itself. number: of the session."""
 
         def changed(event: zenoh.TransportEvent) -> None:
             if event.kind == self._zenoh.SampleKind.DELETE:
