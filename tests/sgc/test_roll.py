@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,17 +52,28 @@ class Query:
         self.dropped.set()
 
 
+class Fed(Roll):
+    """A roll that a test tells who comes and goes."""
+
+    def __init__(self, **limits: Any) -> None:
+        self.feed: deque[tuple[str, bool]] = deque()
+        super().__init__(lambda: self.feed.popleft() if self.feed else None, **limits)
+
+    def changed(self, key: str, present: bool) -> None:
+        self.feed.append((key, present))
+
+
 def here(who: str, name: Name = NAME) -> str:
     return lanes.key(name, lanes.HERE, who)
 
 
 @pytest.fixture
-def kept() -> Iterator[Callable[..., Roll]]:
+def kept() -> Iterator[Callable[..., Fed]]:
     """Makes rolls."""
-    made: list[Roll] = []
+    made: list[Fed] = []
 
-    def make(**limits: Any) -> Roll:
-        made.append(Roll(**limits))
+    def make(**limits: Any) -> Fed:
+        made.append(Fed(**limits))
         return made[-1]
 
     yield make
@@ -96,6 +108,7 @@ def test_who_comes_or_goes_after_an_answer_is_in_the_next_one(kept) -> None:
     eventually(lambda: query.answers == [set(), {AB}])
     one.changed(here(AB), True)  # no news
     one.changed(here(CD), False)
+    time.sleep(3 * roll.PERIOD)
     one.changed(here(CD), True)
     eventually(lambda: query.answers == [set(), {AB}, {AB, CD}])
     one.changed(here(AB), False)

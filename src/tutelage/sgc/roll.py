@@ -5,6 +5,9 @@ changes and then asks the roll who is there. The router's session hears of a cha
 it, so an answer may lack somebody who came, or hold somebody who left, just before the node's subscription counted. So each
 question is kept for a while after its answer, and answered again whenever the name changes: the last answer is right for all
 of whom the subscription says nothing, and the subscription is right for the others (see `transport.watch`).
+
+Changes are fetched rather than called back: a router tells all who follow a name one after the other. If it waited for Python
+in between, what it says of a node that comes back at once might overtake what it says of its leaving.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import re
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,8 +34,11 @@ EVERYBODY = f"*/*/*/{lanes.HERE}/*"
 HOLD = 0.5
 """Seconds for which a question is kept after its first answer; the router's session lags by milliseconds."""
 
-TOGETHER = 0.05
-"""Seconds of patience, so that several questions are let go at a time."""
+PERIOD = 0.05
+"""Seconds between two looks at what has changed and what has been kept long enough. Questions are a look, too."""
+
+WAITING = 1 << 20
+"""Changes that may wait for a look, and tokens of a mesh that a router joins; with more, the network waits."""
 
 HELD = 8192
 """Questions kept at a time. Beyond, the oldest is let go: it has had its time, as a router answers fewer a second."""
@@ -67,47 +74,23 @@ class _Question:
 
 
 class Roll:
-    """Who is present, by name, from `Roll()` to `close`. `changed` and `asked` are called on the network's threads."""
+    """Who is present, by name, from `Roll()` to `close`. `asked` is called on the network's threads."""
 
-    def __init__(self, hold: float = HOLD, held: int = HELD, known: int = KNOWN) -> None:
-        self._hold, self._most_held, self._most_known = hold, held, known
-        self._wake = threading.Condition()
+    def __init__(
+        self, changes: Callable[[], tuple[str, bool] | None], hold: float = HOLD, held: int = HELD, known: int = KNOWN
+    ) -> None:
+        """changes: gives the next token that came (True) or went, None: no further one now. Never waits."""
+        self._changes, self._hold, self._most_held, self._most_known = changes, hold, held, known
+        self._lock = threading.RLock()
         self._present: dict[str, set[bytes]] = {}
         self._known = 0
-        self._full = self._closed = False
+        self._full = False
         self._held: deque[_Question] = deque()  # the oldest first
         self._asking: Counter[str] = Counter()
         self._news: set[str] = set()
+        self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="sgc-roll", daemon=True)
         self._thread.start()
-
-    def changed(self, key: str, present: bool) -> None:
-        """A token came or went."""
-        token = _TOKEN.fullmatch(key)
-        if token is None:
-            return
-        name, who = token[1], bytes.fromhex(token[2])
-        with self._wake:
-            there = self._present.get(name)
-            if self._full or present == (there is not None and who in there):
-                return
-            if present and self._known >= self._most_known:
-                log.warning("more than %d tokens of presence; who asks for them is served more slowly", self._most_known)
-                self._full, self._known = True, 0
-                self._present.clear()
-                return
-            self._known += 1 if present else -1
-            if there is None:
-                self._present[name] = {who}
-            elif present:
-                there.add(who)
-            else:
-                there.discard(who)
-                if not there:
-                    del self._present[name]
-            if name in self._asking:
-                self._news.add(name)
-                self._wake.notify()
 
     def asked(self, query: zenoh.Query) -> None:
         """Answer who is present under a name, and keep the question. Nothing else is answered, and no pattern of names."""
@@ -126,32 +109,67 @@ class Roll:
 
     def close(self) -> None:
         """Keep no question any more, and answer none."""
-        with self._wake:
-            self._closed = True
-            self._wake.notify()
+        self._closed.set()
         self._thread.join()
+        with self._lock:
+            held, self._held = list(self._held), deque()
+        for each in held:
+            each.query.drop()
 
     def __len__(self) -> int:
         """Tokens."""
-        return self._known
+        with self._lock:
+            self._catch_up()
+            return self._known
+
+    def _catch_up(self) -> None:
+        try:
+            while (change := self._changes()) is not None:
+                self._changed(*change)
+        except Exception as error:  # the session has closed
+            log.debug("no presence any more: %s", error)
+
+    def _changed(self, key: str, present: bool) -> None:
+        token = _TOKEN.fullmatch(key)
+        if token is None:
+            return
+        name, who = token[1], bytes.fromhex(token[2])
+        there = self._present.get(name)
+        if self._full or present == (there is not None and who in there):
+            return
+        if present and self._known >= self._most_known:
+            log.warning("more than %d tokens of presence; who asks for them is served more slowly", self._most_known)
+            self._full, self._known = True, 0
+            self._present.clear()
+            return
+        self._known += 1 if present else -1
+        if there is None:
+            self._present[name] = {who}
+        elif present:
+            there.add(who)
+        else:
+            there.discard(who)
+            if not there:
+                del self._present[name]
+        if name in self._asking:
+            self._news.add(name)
 
     def _answer(self, name: str) -> bytes | None:
-        with self._wake:
+        with self._lock:
+            self._catch_up()
             there = self._present.get(name, ())
-            if self._closed or self._full or len(there) > MOST:
+            if self._closed.is_set() or self._full or len(there) > MOST:
                 return None
             return b"".join(sorted(there))
 
     def _keep(self, question: _Question) -> None:
         let_go = question
-        with self._wake:
-            if not self._closed:
+        with self._lock:
+            if not self._closed.is_set():
                 self._held.append(question)
                 self._asking[question.name] += 1
-                if self._answer(question.name) != question.said:  # it changed while it was answered
-                    self._news.add(question.name)
-                if len(self._held) == 1 or self._news:
-                    self._wake.notify()
+                if self._answer(question.name) != question.said:
+                    self._news.add(question.name)  # it changed while it was answered
                 if len(self._held) <= self._most_held:
                     return
                 let_go = self._oldest()
@@ -165,35 +183,26 @@ class Roll:
         return question
 
     def _work(self) -> None:
-        """Answer again what has changed, and let go of what has been kept long enough."""
-        while True:
-            with self._wake:
-                while not (self._closed or self._news):
-                    left = self._held[0].until - time.monotonic() if self._held else None
-                    if left is not None and left <= 0.0:
-                        break
-                    self._wake.wait(None if left is None else max(left, TOGETHER))
-                news, self._news = self._news, set()
-                again = [each for each in self._held if each.name in news]
-                now = time.monotonic()
-                done = []
-                while self._held and (self._closed or self._held[0].until <= now):
-                    done.append(self._oldest())
-                closed = self._closed
-            for each in again:
-                self._answer_again(each)
-            for each in done:
-                each.query.drop()
-            again.clear()
-            done.clear()
-            if closed:
-                return
+        while not self._closed.wait(PERIOD):
+            self._look()
 
-    def _answer_again(self, question: _Question) -> None:
-        answer = self._answer(question.name)
-        if answer is not None and answer != question.said:
-            question.said = answer
-            try:
-                question.query.reply(question.query.key_expr, answer)
-            except Exception as error:
-                log.debug("a question about presence was not answered again: %s", error)
+    def _look(self) -> None:
+        """Answer again what has changed, and let go of what has been kept long enough."""
+        done = []
+        with self._lock:
+            self._catch_up()
+            news, self._news = self._news, set()
+            again = [each for each in self._held if each.name in news] if news else []
+            now = time.monotonic()
+            while self._held and self._held[0].until <= now:
+                done.append(self._oldest())
+        for each in again:
+            answer = self._answer(each.name)
+            if answer is not None and answer != each.said:
+                each.said = answer
+                try:
+                    each.query.reply(each.query.key_expr, answer)
+                except Exception as error:
+                    log.debug("a question about presence was not answered again: %s", error)
+        for each in done:
+            each.query.drop()

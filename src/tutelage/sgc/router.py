@@ -24,7 +24,7 @@ from tutelage.sgc.diagnosis import answer
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.renewal import Renewer
-from tutelage.sgc.roll import EVERYBODY, Roll
+from tutelage.sgc.roll import EVERYBODY, WAITING, Roll
 from tutelage.sgc.transport.base import NoReply
 from tutelage.sgc.transport.config import Endpoint, Identity, Timers, import_zenoh, zenoh_config, zenoh_settings
 from tutelage.sgc.transport.tunnel import TunnelServer
@@ -172,14 +172,14 @@ class Router:
 
     def _keep_roll(self, session: zenoh.Session) -> None:
         """Follow who is present, and answer for it."""
-        roll = self._roll = Roll()
+        tokens = session.liveliness().declare_subscriber(EVERYBODY, self._zenoh.handlers.FifoChannel(WAITING), history=True)
 
-        def changed(sample: zenoh.Sample) -> None:
-            roll.changed(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+        def changes() -> tuple[str, bool] | None:
+            sample = tokens.try_recv()
+            return None if sample is None else (str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
 
-        direct = self._zenoh.handlers.Callback(changed, indirect=False)
-        session.liveliness().declare_subscriber(EVERYBODY, direct, history=True)
-        asked = self._zenoh.handlers.Callback(roll.asked, indirect=False)
+        self._roll = Roll(changes)
+        asked = self._zenoh.handlers.Callback(self._roll.asked, indirect=False)
         session.declare_queryable(EVERYBODY, asked, complete=True)  # complete: in a mesh, the nearest router answers
 
     def _end(self) -> None:
