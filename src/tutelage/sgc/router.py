@@ -11,7 +11,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -172,15 +172,18 @@ class Router:
 
     def _keep_roll(self, session: zenoh.Session) -> None:
         """Follow who is present, and answer for it."""
-        tokens = session.liveliness().declare_subscriber(EVERYBODY, self._zenoh.handlers.FifoChannel(WAITING), history=True)
+        channel, put = self._zenoh.handlers.FifoChannel, self._zenoh.SampleKind.PUT
+        parts = [session.liveliness().declare_subscriber(part, channel(WAITING), history=True) for part in EVERYBODY]
 
-        def changes() -> tuple[str, bool] | None:
-            sample = tokens.try_recv()
-            return None if sample is None else (str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+        def changes() -> Iterator[tuple[str, bool]]:
+            for part in parts:
+                while (sample := part.try_recv()) is not None:
+                    yield str(sample.key_expr), sample.kind == put
 
         self._roll = Roll(changes)
         asked = self._zenoh.handlers.Callback(self._roll.asked, indirect=False)
-        session.declare_queryable(EVERYBODY, asked, complete=True)  # complete: in a mesh, the nearest router answers
+        for part in EVERYBODY:
+            session.declare_queryable(part, asked, complete=True)  # complete: in a mesh, the nearest router answers
 
     def _end(self) -> None:
         for tunnel in self._tunnels:
