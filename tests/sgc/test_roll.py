@@ -312,6 +312,14 @@ def test_a_router_without_a_roll_is_asked_through_zenoh() -> None:
     assert node.present == set()
 
 
+def test_a_listener_that_fails_hears_of_the_next_change() -> None:
+    node = Asked()
+    node.watch._on_change = lambda key, present: node._changed(key, present) or 1 // 0
+    node.answer(bytes.fromhex(AB + CD))
+    node.heard(AB, False)
+    assert node.present == {CD}
+
+
 def test_a_watch_that_has_ended_tells_nothing_and_asks_no_more() -> None:
     node = Asked()
     node.watch.undeclare()

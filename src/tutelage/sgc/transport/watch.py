@@ -149,4 +149,7 @@ class Watch:
                     self._telling = False
                     return
                 key, present = self._changes.popleft()
-            self._on_change(key, present)
+            try:
+                self._on_change(key, present)
+            except Exception:  # the next change is to be told all the same
+                log.exception("a change of presence could not be dealt with")
