@@ -72,6 +72,22 @@ def test_nobody_announces_another() -> None:
         assert tokens == {f"*/*/*/here/{who}"}
 
 
+def test_members_of_a_topic_ask_for_its_presence_and_nobody_for_that_of_all() -> None:
+    tree = access_control(ROUTES, NODES, set(), CONTROL)
+    here = lanes.key(CAMERA, lanes.HERE, "*")
+    for who in ("arm", "server"):
+        mine = {(flow, message) for flow, message, key in allowed(tree, who) if key == here}
+        assert {("ingress", "query"), ("egress", "reply")} <= mine
+        assert not {("ingress", "declare_queryable"), ("ingress", "reply"), ("egress", "query")} & mine
+    assert not any(
+        key.startswith("*") or key == here
+        for who in NODES - {"arm", "server"}
+        for _, message, key in allowed(tree, who)
+        if message in ("query", "liveliness_query", "declare_liveliness_subscriber")
+        and not key.startswith(f"*/*/*/{lanes.ECHO}/")  # which is answered, never asked
+    )
+
+
 def test_routers_pass_on_anything_and_the_revoked_nothing() -> None:
     tree = access_control(ROUTES, NODES, {"router-2", "router-3"}, CONTROL, {"server", "router-3"})
     assert ("ingress", "put", "**") in allowed(tree, "router-2")

@@ -26,6 +26,7 @@ ANNOUNCE = (("ingress", "liveliness_token"),)
 WATCH = (
     ("ingress", "declare_liveliness_subscriber"),
     ("ingress", "liveliness_query"),
+    ("ingress", "query"),  # of the router's roll
     ("egress", "liveliness_token"),
     ("egress", "reply"),
 )

@@ -1,8 +1,8 @@
 """Who is there, by name: what the routing information base of section 8.4 answers.
 
-The base itself is the routers': each node announces its presence under a name, all routers of the mesh know it a moment
-later, and it vanishes with the node. A directory follows the names it is asked to. Presence proves nothing, as a router may
-invent or hide it; packets prove who sent them.
+The base itself is the routers' (`roll`): each node announces its presence under a name, all routers of the mesh know it a
+moment later, and it vanishes with the node. A directory follows the names it is asked to. Presence proves nothing, as a
+router may invent or hide it; packets prove who sent them.
 """
 
 from __future__ import annotations

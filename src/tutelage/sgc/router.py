@@ -11,7 +11,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -24,6 +24,7 @@ from tutelage.sgc.diagnosis import answer
 from tutelage.sgc.home import Home
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.renewal import Renewer
+from tutelage.sgc.roll import EVERYBODY, WAITING, Roll
 from tutelage.sgc.transport.base import NoReply
 from tutelage.sgc.transport.config import Endpoint, Identity, Timers, import_zenoh, zenoh_config, zenoh_settings
 from tutelage.sgc.transport.tunnel import TunnelServer
@@ -80,6 +81,7 @@ class Router:
         self.refusals = Refusals()
         self._zenoh = import_zenoh()
         self._session: zenoh.Session | None = None
+        self._roll: Roll | None = None
         self._identity = Identity(home.root_file, home.leaf_file, home.key_file)
         self._listen = [each for each in config.listen if each.protocol in ("tls", "quic")]
         if len(self._listen) < len(config.listen):
@@ -166,11 +168,30 @@ class Router:
         session.declare_subscriber(deny, self._zenoh.handlers.Callback(self._on_deny, indirect=True))
         rules = lanes.key(self.home.access.control, lanes.RULES)
         session.declare_queryable(rules, self._zenoh.handlers.Callback(self._on_rules, indirect=True))
+        self._keep_roll(session)
+
+    def _keep_roll(self, session: zenoh.Session) -> None:
+        """Follow who is present, and answer for it."""
+        channel, put = self._zenoh.handlers.FifoChannel, self._zenoh.SampleKind.PUT
+        parts = [session.liveliness().declare_subscriber(part, channel(WAITING), history=True) for part in EVERYBODY]
+
+        def changes() -> Iterator[tuple[str, bool]]:
+            for part in parts:
+                while (sample := part.try_recv()) is not None:
+                    yield str(sample.key_expr), sample.kind == put
+
+        self._roll = Roll(changes)
+        asked = self._zenoh.handlers.Callback(self._roll.asked, indirect=False)
+        for part in EVERYBODY:
+            session.declare_queryable(part, asked, complete=True)  # complete: in a mesh, the nearest router answers
 
     def _end(self) -> None:
         for tunnel in self._tunnels:
             tunnel.close()
         self._tunnels.clear()
+        roll, self._roll = self._roll, None
+        if roll is not None:
+            roll.close()
         session, self._session = self._session, None
         if session is not None:
             session.close()

@@ -108,7 +108,7 @@ class Transport(ABC):
     @abstractmethod
     def watch(self, key: str, on_change: Callable[[str, bool], None]) -> Handle:
         """Call `on_change(key, present)` for each presence under the key, which may hold wildcards: those that are there
-        already and every change."""
+        already and every change. What has been told may be told again."""
 
     def renew(self) -> None:
         """The identity on disk has changed: use the new one from now on, without losing packets. May deliver some twice."""

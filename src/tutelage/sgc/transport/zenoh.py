@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tutelage.errors import ConfigError
 from tutelage.sgc.transport.base import Handle, NoReply, Transport, check_key
 from tutelage.sgc.transport.config import Endpoint, Identity, NetworkConfig, import_zenoh, zenoh_config, zenoh_settings
+from tutelage.sgc.transport.watch import Watch
 from tutelage.sgc.workers import Workers
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ SERVING, SLOW = 8, 32
 
 WAITING = 64
 """Requests that may wait for that; further ones are turned away at once."""
+
+WATCHES = 1 << 16
+"""Watches that may wait to be declared in another way."""
 
 
 class _Declaration:
@@ -75,6 +79,8 @@ class ZenohTransport(Transport):
         self._closed = threading.Event()
         self._tunnels: dict[Endpoint, TunnelClient] = {}
         self._pool = Workers("sgc-serve", SERVING, WAITING)
+        self._watching = Workers("sgc-watch", 1, WATCHES)
+        self._sessions = 0
         self._check_identity()
         if not self._connect():
             threading.Thread(target=self._keep_connecting, name="sgc-connect", daemon=True).start()
@@ -146,12 +152,7 @@ class ZenohTransport(Transport):
     def watch(self, key: str, on_change: Callable[[str, bool], None]) -> Handle:
         check_key(key, wildcard=True)
 
-        def changed(sample: zenoh.Sample) -> None:
-            on_change(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
-
-        return self._declare(
-            lambda session: session.liveliness().declare_subscriber(key, self._direct(changed), history=True)
-        )
+        return self._declare(lambda session: Watch(self._zenoh, session, key, on_change, self._watching.submit))
 
     def renew(self) -> None:
         self._check_identity()
@@ -178,8 +179,9 @@ class ZenohTransport(Transport):
             session.close()
         for tunnel in self._tunnels.values():
             tunnel.close()
-        self._pool.close()
-        self._pool.join(1.0)
+        for pool in (self._pool, self._watching):
+            pool.close()
+            pool.join(1.0)
 
     # -- connecting ---------------------------------------------------------------------------------------------------------
 
@@ -229,10 +231,29 @@ class ZenohTransport(Transport):
             if self._closed.is_set():
                 session.close()
                 return
+            self._sessions += 1
+            self._follow(session, self._sessions)
             for declaration in self._declarations:
                 declaration.move(session)
             self._session = session
             self._publishers = {}
+
+    def _follow(self, session: zenoh.Session, number: int) -> None:
+        """Tell the watches when this session loses its router; it looks for another by itself. number: of the session."""
+
+        def changed(event: zenoh.TransportEvent) -> None:
+            if event.kind == self._zenoh.SampleKind.DELETE:
+                self._watching.submit(self._cut_off, number)
+
+        session.info.declare_transport_events_listener(self._direct(changed))
+
+    def _cut_off(self, number: int) -> None:
+        with self._lock:
+            if number != self._sessions or self._session is None:
+                return  # it was closed, as another has taken its place
+            watches = [each.on for each in self._declarations if isinstance(each.on, Watch)]
+        for watch in watches:
+            watch.cut_off()
 
     def _publisher(self, key: str, reliable: bool) -> zenoh.Publisher | None:
         check_key(key)
