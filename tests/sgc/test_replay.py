@@ -20,8 +20,7 @@ def take(
     replay: Replay, first: int, count: int = 1, *, sender: bytes = A, salt: bytes = SALT, sent: int = START
 ) -> Reason | None:
     try:
-        replay.check_time(sent, START)
-        replay.admit(sender, salt, first, count, sent)
+        replay.admit(sender, salt, first, count, sent, START)
     except Refused as refused:
         return refused.reason
     return None

@@ -181,8 +181,8 @@ class Opener:
         if first == 0 or start + TAG > end:
             raise Refused(Reason.MALFORMED, "a packet with an impossible header")
         stream = self._streams.get(name) or _Stream(name)  # of a new one nothing is kept yet: anybody can make up a salt
-        if not flags & BARE:
-            self._replay.check(stream.sender, stream.salt, first, sent, now)  # cheap, so first
+        if not flags & BARE and (self._mode != SESSION or size > _SMALL):  # else to open it costs no more than this look
+            self._replay.check(stream.sender, stream.salt, first, sent, now)
         if not self._looked <= now <= self._look_at or self._versions != (self._keyring.version, self._home.version):
             self._look(now)
         if stream.look != self._look_count:
@@ -219,7 +219,7 @@ class Opener:
                 member.signing.verify(signature, self._statements.message(raw, bind, body))
             except InvalidSignature:
                 raise Refused(Reason.FORGED, f"a message of {self.alias} that {member.node} did not sign") from None
-        self._replay.admit(stream.sender, salt, first, len(messages), sent)
+        self._replay.admit(stream.sender, salt, first, len(messages), sent, now)
         if stream.member is not member:
             self._remember(stream, member)
         return messages
@@ -240,7 +240,7 @@ class Opener:
         with self._lock:
             ready = self._confirmation.message((stream.sender, stream.salt), first, statement, messages, len(body), now)
         if ready is not None:
-            self._replay.admit(stream.sender, stream.salt, first, len(ready), messages[0].sent)
+            self._replay.admit(stream.sender, stream.salt, first, len(ready), messages[0].sent, now)
         if stream.member is not member:
             self._remember(stream, member)
         if flags & ANCHOR:
@@ -251,8 +251,7 @@ class Opener:
         anchor = _decrypt(stream.cipher, purpose, proof, raw)
 
         def admit(first: int, messages: list[Opened]) -> None:
-            self._replay.check_time(messages[0].sent, now)
-            self._replay.admit(stream.sender, stream.salt, first, len(messages), messages[0].sent)
+            self._replay.admit(stream.sender, stream.salt, first, len(messages), messages[0].sent, now)
 
         with self._lock:
             return self._confirmation.anchor((stream.sender, stream.salt), anchor, member.signing, admit)

@@ -103,18 +103,20 @@ class Replay:
             Refused: TOO_OLD, FUTURE, REPLAYED or STALE.
         """
         if not now - self._max_age <= sent <= now + TOLERANCE_NS:
-            self.check_time(sent, now)
+            self._check_time(sent, now)
         known = self._senders.get(sender)
         window = known.windows.get(salt) if known is not None else None
         if window is None or first <= window.highest:  # else it is new, as nearly all are
             self._check(known, window, first, 1, sent)
 
-    def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int) -> None:
-        """Take a message (a batch of `count`) that is authentic, once. Its time is for `check_time` to check.
+    def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int, now: int) -> None:
+        """Take a message (a batch of `count`) that is authentic, once.
 
         Raises:
-            Refused: REPLAYED or STALE.
+            Refused: TOO_OLD, FUTURE, REPLAYED or STALE.
         """
+        if not now - self._max_age <= sent <= now + TOLERANCE_NS:
+            self._check_time(sent, now)
         with self._lock:
             known = self._senders.get(sender)
             window = known.windows.get(salt) if known is not None else None
@@ -132,7 +134,7 @@ class Replay:
                 known.windows.move_to_end(salt)
             window.add(first, count, sent)
 
-    def check_time(self, sent: int, now: int) -> None:
+    def _check_time(self, sent: int, now: int) -> None:
         """Is a time of sending neither too long ago nor in the future?
 
         Raises:
