@@ -36,8 +36,8 @@ authenticity = "{mode}"
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """Microseconds a message to seal and to open. `batch` is signatures with 64 messages of up to 8 KiB a packet; `session` has
-    one receiver."""
+    """Microseconds a message to seal and to open. `batch` is signatures with 64 messages of up to 8 KiB a packet; `session`
+    has one receiver."""
     with tempfile.TemporaryDirectory() as folder:
         robot, server = _nodes(Path(folder))
         results = [measure(robot, server, size, quick) for size in SIZES]

@@ -13,6 +13,7 @@ from typing import Any
 from benchmarks.connectivity.stacks import FAR, NEAR, OURS, OVER_QUIC, alias
 from tutelage.sgc import lanes
 from tutelage.sgc.local import LocalFleet
+from tutelage.sgc.ports import free_ports
 
 LOOPBACK = """<CycloneDDS><Domain Id="any">
 <General>
@@ -46,19 +47,6 @@ def policy() -> str:
                 f'publish = ["{sender}"]\nsubscribe = ["{receiver}"]\nauthenticity = "{mode}"\n'
             )
     return "\n".join(tables)
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports of loopback that nobody uses, TCP and UDP."""
-    import socket
-
-    with ExitStack() as stack:
-        found = []
-        for _ in range(count):
-            tcp = stack.enter_context(socket.socket())
-            tcp.bind(("127.0.0.1", 0))
-            found.append(tcp.getsockname()[1])
-        return found
 
 
 @contextmanager

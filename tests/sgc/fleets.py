@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 import time
@@ -14,6 +13,7 @@ from pathlib import Path
 from sgc import members
 
 from tutelage.sgc.home import Home
+from tutelage.sgc.ports import free_port
 from tutelage.sgc.router import Router, RouterConfig
 from tutelage.sgc.rules import Role
 
@@ -83,13 +83,6 @@ def behind_a_router(folder: Path, policy: str, names: Sequence[str]) -> Iterator
         (fleet[name].path / "network.toml").write_text(f'version = 1\nrouters = ["{address}"]\n')
     with Router(fleet["router"], RouterConfig.of([address])):
         yield fleet
-
-
-def free_port() -> int:
-    """A TCP port of loopback that nobody uses, and no other test of this run is given."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def eventually(condition: Callable[[], object], timeout: float = 10.0, every: float = 0.005) -> None:

@@ -8,7 +8,6 @@ Everything is as in the field (keys, access control, sealing); only that one pro
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +16,7 @@ from typing import Self
 from tutelage.sgc.authority import Authority
 from tutelage.sgc.home import Home
 from tutelage.sgc.node import Node
+from tutelage.sgc.ports import free_ports
 from tutelage.sgc.router import Router, RouterConfig
 from tutelage.sgc.rules import Role
 from tutelage.sgc.transport.config import Endpoint, NetworkConfig
@@ -66,7 +66,7 @@ class LocalFleet:
             home.accept(self.authority.issue(home.request()))
         self.publish(policy)
         self.routers: list[Router] = []
-        self.addresses = [f"{protocol}/{host}:{port}" for port in _free_ports(routers)]
+        self.addresses = [f"{protocol}/{host}:{port}" for port in free_ports(routers)]
         network = NetworkConfig(tuple(map(Endpoint.parse, self.addresses)))
         for node in nodes:
             network.save(self.homes[node].path)
@@ -96,15 +96,3 @@ class LocalFleet:
         for router in self.routers:
             router.close()
         self.routers.clear()
-
-
-def _free_ports(count: int) -> list[int]:
-    """Ports of loopback that nobody uses."""
-    sockets = [socket.socket() for _ in range(count)]
-    try:
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [int(each.getsockname()[1]) for each in sockets]
-    finally:
-        for each in sockets:
-            each.close()

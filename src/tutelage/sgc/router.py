@@ -8,7 +8,6 @@ this one again within a second, and what they missed is replayed.
 from __future__ import annotations
 
 import logging
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,7 @@ from tutelage.sgc.access import Role
 from tutelage.sgc.acl import access_control
 from tutelage.sgc.diagnosis import answer
 from tutelage.sgc.home import Home
+from tutelage.sgc.ports import free_port
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.renewal import Renewer
 from tutelage.sgc.roll import EVERYBODY, WAITING, Roll
@@ -85,7 +85,7 @@ class Router:
         self._identity = Identity(home.root_file, home.leaf_file, home.key_file)
         self._listen = [each for each in config.listen if each.protocol in ("tls", "quic")]
         if len(self._listen) < len(config.listen):
-            self._listen.append(Endpoint("tls", "127.0.0.1", _free_port()))  # where tunnels end
+            self._listen.append(Endpoint("tls", "127.0.0.1", free_port()))  # where tunnels end
         self._tunnels: list[TunnelServer] = []
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="sgc-router", daemon=True)
@@ -253,9 +253,3 @@ class Router:
             except ConfigError:
                 if time.monotonic() > until or self._closed.wait(0.1):
                     raise
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

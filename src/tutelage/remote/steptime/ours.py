@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from tutelage.errors import TutelageError
 from tutelage.remote.fleet import RemoteFleet
 from tutelage.remote.setup import new_fleet
+from tutelage.sgc.ports import free_port
 
 Array = NDArray[Any]
 
@@ -61,7 +61,7 @@ class Camera:
 
 def measure(robots: int, steps: int, height: int, width: int, folder: Path) -> list[float]:
     """Seconds of each fleet step: an action to every robot, and the image after it from every robot."""
-    port = _free_port()
+    port = free_port()
     made = new_fleet(folder, robots, connect=f"tls/127.0.0.1:{port}", cameras=())
     with contextlib.ExitStack() as stack:
         stack.enter_context(_running("router", made.router, "--listen", f"tls/127.0.0.1:{port}"))
@@ -102,9 +102,3 @@ def _running(*words: object, size: str = "") -> Iterator[None]:
         finally:
             program.kill()
             program.wait()
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

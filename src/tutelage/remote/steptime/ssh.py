@@ -13,7 +13,6 @@ import getpass
 import multiprocessing
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -25,6 +24,7 @@ import numpy as np
 
 from tutelage.errors import TutelageError
 from tutelage.remote.steptime.ours import picture
+from tutelage.sgc.ports import free_port
 
 ROBOT = """
 import sys
@@ -157,9 +157,7 @@ def _server(folder: Path) -> Iterator[int]:
         )
     if os.geteuid() == 0:
         Path("/run/sshd").mkdir(mode=0o755, exist_ok=True)  # which sshd asks for when it starts as root
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
+    port = free_port()
     settings = folder / "sshd_config"
     settings.write_text(
         f"Port {port}\nListenAddress 127.0.0.1\nHostKey {folder / 'host'}\nAuthorizedKeysFile {folder / 'key.pub'}\n"
