@@ -65,7 +65,8 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 # Rendering tests need an OpenGL library without a screen, network tests need tools for namespaces and address translation,
 # tests of the console's page need Chromium.
-# Installed where that is allowed (root and apt); elsewhere the tests that need them skip and say so.
+# Installed where that is allowed (root and apt); elsewhere the tests that need them skip and say so. Only in CI: an SSH server,
+# which would begin to listen on a machine of one's own, and a compiler for a second DDS vendor.
 $(SYSTEM): $(INSTALLED)
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! $(BIN)/python -c "import ctypes; ctypes.CDLL('libEGL.so.1')" 2>/dev/null; then \
 	  apt-get update -qq && apt-get install -qq -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libosmesa6 >/dev/null; fi
@@ -73,4 +74,9 @@ $(SYSTEM): $(INSTALLED)
 	  apt-get update -qq && apt-get install -qq -y --no-install-recommends iproute2 nftables >/dev/null; fi
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! command -v chromium >/dev/null; then \
 	  apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium fonts-dejavu-core >/dev/null; fi
+	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && [ -n "$$CI" ] && ! command -v sshd >/dev/null; then \
+	  apt-get update -qq && apt-get install -qq -y --no-install-recommends openssh-client openssh-server >/dev/null; fi
+	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && [ -n "$$CI" ] && ! dpkg -s g++ libfastrtps-dev >/dev/null 2>&1; then \
+	  apt-get update -qq && apt-get install -qq -y --no-install-recommends g++ libfastrtps-dev libfastcdr-dev >/dev/null \
+	  || echo "no Fast DDS in this distribution: the test with a second DDS vendor is skipped"; fi
 	touch $@
