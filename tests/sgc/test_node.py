@@ -127,9 +127,8 @@ def test_renewed_sessions_do_not_add_up(arm: Node, server: Node, monkeypatch: py
     eventually(lambda: in_order(got, sent))
 
 
-def test_a_patient_caller_sends_large_messages_itself(network: Network, arm: Node) -> None:
-    """Everybody else leaves them to the publisher's thread, as the network may be slow."""
-    log = arm.publisher("log-signature")
+def senders_of_large(network: Network) -> list[str]:
+    """Names of the threads that send packets of more than `PIECE` bytes from now on."""
     threads: list[str] = []
 
     def tap(key: str, packet: bytes) -> list[tuple[str, bytes]]:
@@ -138,6 +137,13 @@ def test_a_patient_caller_sends_large_messages_itself(network: Network, arm: Nod
         return [(key, packet)]
 
     network.tap = tap
+    return threads
+
+
+def test_a_patient_caller_sends_large_messages_itself(network: Network, arm: Node) -> None:
+    """Everybody else leaves them to the publisher's thread, as the network may be slow."""
+    log = arm.publisher("log-signature")
+    threads = senders_of_large(network)
     for wait in (PATIENT, 0.0):
         eventually(lambda: not log._busy and time.monotonic() > log._free_at)
         log.send(bytes(PIECE), wait=wait)
@@ -152,14 +158,7 @@ def test_a_direct_callback_does_not_wait_for_the_network(network: Network, arm: 
     server.subscribe("log-signature", lambda message: inside.append(there in lent), direct=True)
     eventually(lambda: log.send(b"?") or True in inside, every=0.05)
     assert there not in lent
-    threads: list[str] = []
-
-    def tap(key: str, packet: bytes) -> list[tuple[str, bytes]]:
-        if len(packet) > PIECE:
-            threads.append(threading.current_thread().name)
-        return [(key, packet)]
-
-    network.tap = tap
+    threads = senders_of_large(network)
     eventually(lambda: not log._busy and time.monotonic() > log._free_at)
     lent.add(there)
     try:

@@ -361,6 +361,11 @@ class Seen(dict[str, bool]):
         return {who for who, present in self.items() if present}
 
 
+def hears_of(router: Router, tokens: int) -> None:
+    """Wait until the roll of a router holds so many."""
+    eventually(lambda: router._roll is not None and len(router._roll) == tokens)
+
+
 def names(fleet: Fleet) -> tuple[Name, Name]:
     return fleet["arm"].access.entry("log").name, fleet["arm"].access.entry("camera").name
 
@@ -397,7 +402,7 @@ def test_who_dies_is_gone(fleet: Fleet) -> None:
     with Router(fleet["router-1"], RouterConfig.of([where])) as router, transport(fleet["server"], where) as other:
         with transport(fleet["arm"], where) as one:
             one.announce(here(arm, log))
-            eventually(lambda: router._roll is not None and len(router._roll) == 1)
+            hears_of(router, 1)
             seen = Seen(other, log)
             eventually(lambda: seen.present == {arm})
         eventually(lambda: seen == {arm: False})
@@ -433,7 +438,7 @@ def test_a_stranger_learns_nothing_from_the_roll(fleet: Fleet) -> None:
         transport(fleet["server"], where) as member,
     ):
         one.announce(here(arm, log))
-        eventually(lambda: router._roll is not None and len(router._roll) == 1)
+        hears_of(router, 1)
         for pattern in (here("*", log), "*/*/*/here/*", *roll.EVERYBODY[:2], "**", here("**", log), here(arm, log)):
             for asker in (thief, member):
                 replies = asker._session.get(pattern, timeout=0.5)
@@ -452,7 +457,7 @@ def test_who_left_while_the_router_was_away_is_gone(fleet: Fleet) -> None:
             eventually(lambda: other.connected)
             one.announce(here(arm, log))
             one.announce(here(arm, camera))
-            eventually(lambda: router._roll is not None and len(router._roll) == 2)
+            hears_of(router, 2)
             seen, stays = Seen(other, log), Seen(other, camera)
             eventually(lambda: seen.present == stays.present == {arm})
             router._end()
@@ -474,7 +479,7 @@ def test_a_watch_survives_a_renewed_certificate(fleet: Fleet) -> None:
         transport(fleet["server"], where) as other,
     ):
         stays, leaves = one.announce(here(arm, log)), one.announce(here(arm, camera))
-        eventually(lambda: router._roll is not None and len(router._roll) == 2)
+        hears_of(router, 2)
         seen, gone = Seen(other, log), Seen(other, camera)
         eventually(lambda: seen.present == gone.present == {arm})
         other.renew()

@@ -40,29 +40,23 @@ class Frame:
 
     Attributes:
         kind: what it is.
-        age: seconds since the sender began the stream, on its own clock.
         index, count: of the piece; 0 and 1 for a whole message.
-        total: bytes of the whole message.
     """
 
     kind: Kind
-    age: float
     index: int = 0
     count: int = 1
-    total: int = 0
 
 
-def label(kind: Kind, age: float) -> bytes:
-    """Of a whole message or a sign of life. age: seconds."""
-    return _LABEL.pack(kind, min(int(age * 1000), _LONGEST_AGE), 0, 0)
+def label(kind: Kind, age: float, index: int = 0, total: int = 0) -> bytes:
+    """Of a frame. age: seconds. index, total: of a piece, and bytes of its whole message."""
+    return _LABEL.pack(kind, min(int(age * 1000), _LONGEST_AGE), index, total)
 
 
 def pieces(payload: memoryview, age: float) -> Iterator[tuple[bytes, memoryview]]:
     """The labels and pieces of a message that is larger than `PIECE`."""
-    milliseconds = min(int(age * 1000), _LONGEST_AGE)
     for index in range(-(-len(payload) // PIECE)):
-        label = _LABEL.pack(Kind.PIECE, milliseconds, index, len(payload))
-        yield label, payload[index * PIECE : (index + 1) * PIECE]
+        yield label(Kind.PIECE, age, index, len(payload)), payload[index * PIECE : (index + 1) * PIECE]
 
 
 def age_of(label: bytes) -> float:
@@ -76,12 +70,11 @@ def parse(label: bytes, body: bytes) -> Frame:
     Raises:
         Refused: MALFORMED.
     """
-    kind, milliseconds, index, total = _LABEL.unpack(label)
-    age = milliseconds / 1000
+    kind, _, index, total = _LABEL.unpack(label)
     if kind == Kind.WHOLE:
-        return Frame(Kind.WHOLE, age, total=len(body))
+        return Frame(Kind.WHOLE)
     if kind == Kind.LIFE and not body:
-        return Frame(Kind.LIFE, age)
+        return Frame(Kind.LIFE)
     if kind != Kind.PIECE:
         raise Refused(Reason.MALFORMED, "a frame of no known kind")
     count = -(-total // PIECE)
@@ -89,7 +82,7 @@ def parse(label: bytes, body: bytes) -> Frame:
         raise Refused(Reason.MALFORMED, "a piece of an impossible message")
     if len(body) != (PIECE if index < count - 1 else total - index * PIECE):
         raise Refused(Reason.MALFORMED, "a piece of the wrong length")
-    return Frame(Kind.PIECE, age, index, count, total)
+    return Frame(Kind.PIECE, index, count)
 
 
 class Assembly:

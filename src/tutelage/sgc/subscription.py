@@ -378,10 +378,10 @@ class Subscription:
             received, packet = item
             opened = self._open(received, packet)
             if opened:
-                self._heard(opened[-1], received)
                 more = self._assembler.messages(self.delivery.accept_all(opened, time.monotonic()), received)
                 newest += more
                 count += len(more)
+                self._heard(opened[-1], received)
             try:
                 item = self._inbox.get_nowait()
             except queues.Empty:
