@@ -196,6 +196,51 @@ def test_a_direct_subscription_gets_the_same_on_the_networks_thread(
     assert any(not name.startswith("sgc-subscribe") for name in threads)
 
 
+def test_a_direct_subscription_opens_what_comes_next_in_one_step(
+    arm: Node, server: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Small messages between large ones and pauses are counted and delivered as any other."""
+    got, long_way = Received(), list[int]()
+    subscription = server.subscribe("log-session", got, direct=True)
+    log = arm.publisher("log-session")
+    acquainted(log.send, got)
+    open_many = subscription.opener.open_many
+    monkeypatch.setattr(subscription.opener, "open_many", lambda *a, **k: [long_way.append(1), open_many(*a, **k)][1])
+    heard, packets = len(got), subscription.packets
+    sent = [b"%d" % k + bytes(2 * PIECE if k % 50 == 49 else 0) for k in range(200)]
+    for payload in sent:
+        log.send(payload)
+        assert log.flush(5.0)
+    eventually(lambda: len(got) == heard + len(sent))
+    assert [each.payload for each in got[heard:]] == sent
+    assert [each.sequence for each in got[heard:]] == sorted({each.sequence for each in got[heard:]})
+    assert subscription.packets - packets >= len(sent) + 8
+    assert len(long_way) < len(sent) / 2  # pieces, what follows them, and the first after each look and sign of life
+    assert subscription.lost == 0
+
+
+def test_what_an_earlier_program_sends_next_is_not_taken_for_the_present_ones(
+    fleet: Fleet, network: Network, arm: Node, server: Node
+) -> None:
+    """Two programs of one node: the number that the earlier one's message has is the one that the later one's next has."""
+    got = Received()
+    server.subscribe("log-session", got, direct=True)
+    before = arm.publisher("log-session")
+    acquainted(before.send, got)
+    with Node.open(fleet["arm"], MemoryTransport(network)) as again:
+        now = again.publisher("log-session")
+        eventually(lambda: now.send(b"0") or got.numbers[-1:] == [0], every=0.05)
+        for _ in range(20):
+            while now._sealer.sequence < before._sealer.sequence + 1:
+                now.send(b"1")
+                assert now.flush(5.0)
+            while before._sealer.sequence < now._sealer.sequence + 2:
+                before.send(b"-2")
+                assert before.flush(5.0)
+    assert got.numbers.count(1) > 20
+    assert -2 not in got.numbers
+
+
 def test_a_direct_subscription_needs_a_callback(server: Node) -> None:
     with pytest.raises(ConfigError, match="a direct subscription of log-signature needs a callback"):
         server.subscribe("log-signature", direct=True)

@@ -9,6 +9,8 @@ from tutelage.sgc.messages import Message, make_message
 from tutelage.sgc.reasons import Refusals, Refused
 from tutelage.sgc.sealing import Opened
 
+_WHOLE = frames.Kind.WHOLE
+
 
 class Assembler:
     """Puts the messages of one topic together. Not for several threads at once."""
@@ -21,23 +23,29 @@ class Assembler:
             present: salts of the senders' present starts; what earlier ones left incomplete is forgotten.
         """
         self._alias, self._refusals, self._present = alias, refusals, present
-        self._assemblies: dict[bytes, frames.Assembly] = {}
+        self.unfinished: dict[bytes, frames.Assembly] = {}
+        """Messages of which pieces are still to come, by the salt of the stream."""
 
     def messages(self, opened: list[Opened], received: float) -> list[Message]:
         """The messages that these frames complete. received: seconds since 1970."""
         messages, alias = [], self._alias
         for body, sender, sequence, salt, sent, _, authentic, _, label in opened:
-            try:
-                payload = (self._assemblies.get(salt) or self._begin(salt)).take(sequence, label, body)
-            except Refused as refused:
-                self._refusals.add(refused.reason)
-                continue
+            whole = label[0] == _WHOLE and not self.unfinished  # as nearly all are
+            payload = body if whole else self._assemble(salt, sequence, label, body)
             if payload is not None:
                 messages.append(make_message((payload, sender, alias, sequence, sent * 1e-9, received, authentic)))
         return messages
 
-    def _begin(self, salt: bytes) -> frames.Assembly:
-        present = self._present()
-        self._assemblies = {each: assembly for each, assembly in self._assemblies.items() if each in present}
-        assembly = self._assemblies[salt] = frames.Assembly()
-        return assembly
+    def _assemble(self, salt: bytes, sequence: int, label: bytes, body: bytes) -> bytes | None:
+        """The message that a frame completes, if any."""
+        assembly = self.unfinished.pop(salt, None) or frames.Assembly()
+        try:
+            return assembly.take(sequence, label, body)
+        except Refused as refused:
+            self._refusals.add(refused.reason)
+            return None
+        finally:
+            if assembly.unfinished:
+                present = self._present()
+                self.unfinished = {each: other for each, other in self.unfinished.items() if each in present}
+                self.unfinished[salt] = assembly

@@ -133,6 +133,10 @@ class Delivery(ABC):
         """Does so much wait behind gaps that further packets had better stay unopened, to be fetched again later?"""
         return False
 
+    def current(self, sender: str) -> Stream | None:
+        """The messages of a sender's present start."""
+        return self._current.get(sender)
+
     def salts(self) -> set[bytes]:
         """Of the senders' present starts."""
         return {stream.salt for stream in self._current.values()}

@@ -20,7 +20,7 @@ MAX_MESSAGE = 256 << 20
 """Bytes of the largest message. A receiver sets memory aside for a message that has begun, so there must be a limit."""
 
 _LABEL = struct.Struct(">B3xIII")
-_LONGEST_AGE = 0xFFFFFFFF
+_LONGEST_AGE = 4_000_000  # seconds; in milliseconds it just fits
 
 
 class Kind(IntEnum):
@@ -29,9 +29,6 @@ class Kind(IntEnum):
     WHOLE = 0
     PIECE = 1
     LIFE = 2  # nothing but a sequence number: shows that the sender lives and what it has sent so far
-
-
-_WHOLE = int(Kind.WHOLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +47,7 @@ class Frame:
 
 def label(kind: Kind, age: float, index: int = 0, total: int = 0) -> bytes:
     """Of a frame. age: seconds. index, total: of a piece, and bytes of its whole message."""
-    return _LABEL.pack(kind, min(int(age * 1000), _LONGEST_AGE), index, total)
+    return _LABEL.pack(kind, int(age * 1000) if age < _LONGEST_AGE else _LONGEST_AGE * 1000, index, total)
 
 
 def pieces(payload: memoryview, age: float) -> Iterator[tuple[bytes, memoryview]]:
@@ -94,14 +91,17 @@ class Assembly:
         self.broken = 0
         """Messages of which a piece is missing."""
 
+    @property
+    def unfinished(self) -> bool:
+        """Has a message begun that is not complete?"""
+        return bool(self._parts)
+
     def take(self, sequence: int, label: bytes, body: bytes) -> bytes | None:
         """The message that a frame completes, if any.
 
         Raises:
             Refused: MALFORMED.
         """
-        if label[0] == _WHOLE and not self._parts:  # as nearly all are
-            return body
         frame = parse(label, body)
         if self._parts and (sequence != self._next or frame.index != len(self._parts)):
             self._parts.clear()

@@ -10,6 +10,7 @@ from cryptography.exceptions import InvalidSignature, InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from tutelage.sgc.chain import Confirmation
+from tutelage.sgc.due import Due
 from tutelage.sgc.errors import NotAllowed
 from tutelage.sgc.grants import key_id
 from tutelage.sgc.keyring import Keyring
@@ -19,6 +20,7 @@ from tutelage.sgc.packet import (
     BARE_BODY,
     BARE_PROOF,
     BATCH,
+    BEGINNING,
     BODY,
     CHAIN,
     HEADER,
@@ -46,7 +48,7 @@ from tutelage.sgc.packet import (
     split_batch,
 )
 from tutelage.sgc.reasons import Reason, Refusals, Refused
-from tutelage.sgc.replay import MAX_SENDERS, Replay
+from tutelage.sgc.replay import MAX_SENDERS, Replay, Window
 from tutelage.sgc.rules import Lane, Role
 from tutelage.sgc.session import Handshake, Session
 from tutelage.sgc.trust import Member
@@ -100,6 +102,7 @@ class Opener:
         self._members: OrderedDict[bytes, Member] = OrderedDict()
         self._sessions: OrderedDict[bytes, Session] = OrderedDict()  # by sender, salt and id
         self._replacements: list[bytes] = []
+        self._last: tuple[bytes, int, _Stream, Window] | None = None
 
     def open(self, packet: Buffer, *, bind: bytes = b"", now: int | None = None) -> Opened:
         """The one message of a packet.
@@ -163,7 +166,31 @@ class Opener:
             told, self._replacements = self._replacements, []
             return told
 
+    def due(self) -> Due | None:
+        """The packet that follows the one that was opened last; None: that one was not a message for one session."""
+        if self._last is None or (sole := self._last[2].sole) is None:
+            return None
+        beginning, kind, stream, window = self._last
+        (session, cipher), (keys, beliefs) = sole, self._versions
+        return Due(
+            beginning=beginning,
+            kind=kind,
+            ident=session.ident,
+            cipher=cipher,
+            window=window,
+            sender=session.member.node,
+            salt=stream.salt,
+            keyring=self._keyring,
+            keys=keys,
+            home=self._home,
+            beliefs=beliefs,
+            since=self._looked,
+            until=min(self._look_at, session.until - 1),
+            max_age=self._replay.max_age,
+        )
+
     def _open(self, packet: Buffer, bind: bytes, now: int) -> list[Opened]:
+        self._last = None
         size = len(packet)
         if size > _SMALL or not isinstance(packet, bytes):
             packet = memoryview(packet)
@@ -219,9 +246,11 @@ class Opener:
                 member.signing.verify(signature, self._statements.message(raw, bind, body))
             except InvalidSignature:
                 raise Refused(Reason.FORGED, f"a message of {self.alias} that {member.node} did not sign") from None
-        self._replay.admit(stream.sender, salt, first, len(messages), sent, now)
+        window = self._replay.admit(stream.sender, salt, first, len(messages), sent, now)
         if stream.member is not member:
             self._remember(stream, member)
+        if flags == SOLE and not bind:
+            self._last = raw[:BEGINNING], label[0], stream, window
         return messages
 
     def _chained(

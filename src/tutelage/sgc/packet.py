@@ -43,8 +43,11 @@ _HEADER = struct.Struct(">BBHHHI16s16sQQ16s")
 _LAYOUT = struct.Struct(">BBHHH")
 _STREAM = struct.Struct(">I16s16s")
 HEADER = _HEADER.size
+BEGINNING = 44
+"""Bytes of a header that are alike from packet to packet while nothing special happens: up to the sequence number."""
 _FLAGS = 3
-_IDENT, _SEQUENCE = slice(12, 52), slice(44, 52)
+SEQUENCE = slice(44, 52)
+_IDENT = slice(12, 52)
 NO_LABEL = bytes(16)
 SESSION_ID = 8
 SLOT = SESSION_ID + TAG
@@ -77,6 +80,9 @@ make_header = _HEADER.pack
 
 read_header = struct.Struct(">8s36sQQ16s").unpack
 """The layout in 8 bytes, the stream in 36, two numbers, sequence and time of sending, and the label."""
+
+read_end = struct.Struct(">QQ16s").unpack_from
+"""What follows the beginning: two numbers, sequence and time of sending, and the label."""
 
 read_stream = _STREAM.unpack
 """Epoch, sender and salt."""
@@ -115,7 +121,7 @@ def anchored(packet: Buffer) -> bool:
 def nonce(purpose: bytes, header: bytes) -> bytes:
     """12 bytes that never repeat under one key: what for, and the sequence number in a header. Keys differ by salt, and a
     salt is never used twice."""
-    return purpose + header[_SEQUENCE]
+    return purpose + header[SEQUENCE]
 
 
 def message_key(epoch_key: bytes, name: bytes, lane: Lane, epoch: int, sender: bytes, salt: bytes) -> bytes:

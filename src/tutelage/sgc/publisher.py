@@ -210,19 +210,17 @@ class Publisher:
         """Seal and send; without a key, back into the queue."""
         try:
             payload, sent = batch[0]
-            size, age, seal = len(payload), now - self._born, self._sealer.seal
+            age, seal = now - self._born, self._sealer.seal
             if len(batch) > 1:
-                payloads = [payload for payload, _ in batch]
-                packet = self._sealer.seal_many(payloads, label=frames.label(_WHOLE, age), now=sent)
+                packet = self._sealer.seal_many([each for each, _ in batch], label=frames.label(_WHOLE, age), now=sent)
                 self._hand_over(len(batch), packet, now)
-                size = sum(map(len, payloads))
-            elif size <= frames.PIECE:
+            elif len(payload) <= frames.PIECE:
                 self._hand_over(1, seal(payload, label=frames.label(_WHOLE, age), now=sent), now)
             else:
                 for label, piece in frames.pieces(memoryview(payload), age):
                     self._hand_over(1, seal(piece, label=label, now=sent), now)
             self.sent += len(batch)
-            self.bytes += size
+            self.bytes += sum([len(each) for each, _ in batch])
         except NoKey:
             with self._changed:
                 self._queue.put_back(batch)

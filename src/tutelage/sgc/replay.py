@@ -77,7 +77,11 @@ def _spans(first: int, count: int) -> Iterator[tuple[int, int]]:
 
 
 class Replay:
-    """Windows of all senders of one topic and lane, as one receiver sees them. Safe to use from several threads."""
+    """Windows of all senders of one topic and lane, as one receiver sees them. Safe to use from several threads.
+
+    Attributes:
+        max_age: nanoseconds.
+    """
 
     def __init__(self, max_age: float | None, started: int) -> None:
         """
@@ -93,7 +97,7 @@ class Replay:
 
     def set_max_age(self, max_age: float | None) -> None:
         """The policy may change it. Seconds."""
-        self._max_age = _ENDLESS if max_age is None else round(max_age * 1e9)
+        self.max_age = _ENDLESS if max_age is None else round(max_age * 1e9)
 
     def check(self, sender: bytes, salt: bytes, first: int, sent: int, now: int) -> None:
         """Could a message be taken, as far as its header says? Remembers nothing, so it may be asked before the message is
@@ -102,20 +106,20 @@ class Replay:
         Raises:
             Refused: TOO_OLD, FUTURE, REPLAYED or STALE.
         """
-        if not now - self._max_age <= sent <= now + TOLERANCE_NS:
+        if not now - self.max_age <= sent <= now + TOLERANCE_NS:
             self._check_time(sent, now)
         known = self._senders.get(sender)
         window = known.windows.get(salt) if known is not None else None
         if window is None or first <= window.highest:  # else it is new, as nearly all are
             self._check(known, window, first, 1, sent)
 
-    def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int, now: int) -> None:
-        """Take a message (a batch of `count`) that is authentic, once.
+    def admit(self, sender: bytes, salt: bytes, first: int, count: int, sent: int, now: int) -> Window:
+        """Take a message (a batch of `count`) that is authentic, once. Returns the window of its stream.
 
         Raises:
             Refused: TOO_OLD, FUTURE, REPLAYED or STALE.
         """
-        if not now - self._max_age <= sent <= now + TOLERANCE_NS:
+        if not now - self.max_age <= sent <= now + TOLERANCE_NS:
             self._check_time(sent, now)
         with self._lock:
             known = self._senders.get(sender)
@@ -133,6 +137,7 @@ class Replay:
                 self._senders.move_to_end(sender)
                 known.windows.move_to_end(salt)
             window.add(first, count, sent)
+            return window
 
     def _check_time(self, sent: int, now: int) -> None:
         """Is a time of sending neither too long ago nor in the future?
@@ -143,8 +148,8 @@ class Replay:
         if sent > now + TOLERANCE_NS:
             ahead = (sent - now) / 1e9
             raise Refused(Reason.FUTURE, f"sent {ahead:.1f} s in the future: the sender's clock is ahead, or ours is late")
-        if now - sent > self._max_age:
-            age, limit = (now - sent) / 1e9, self._max_age / 1e9
+        if now - sent > self.max_age:
+            age, limit = (now - sent) / 1e9, self.max_age / 1e9
             raise Refused(Reason.TOO_OLD, f"sent {age:.2f} s ago, and the topic's maximum age is {limit:g} s")
 
     def _check(self, known: _Sender | None, window: Window | None, first: int, count: int, sent: int) -> None:

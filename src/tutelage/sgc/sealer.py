@@ -31,6 +31,7 @@ from tutelage.sgc.packet import (
     NO_LABEL,
     PROOF,
     SALT_BYTES,
+    SEQUENCE,
     SESSION,
     SESSION_ID,
     SIGNATURE,
@@ -128,7 +129,23 @@ class Sealer:
             NotAllowed: the policy has changed.
             ConfigError: the payload is too long.
         """
-        return self._seal(_flat(payload) if isinstance(payload, memoryview) else payload, 0, 1, label, bind, now)
+        with self._lock:
+            now = time.time_ns() if now is None else now
+            sole = self._sole
+            if (
+                sole is not None
+                and type(payload) is bytes
+                and len(payload) <= _SMALL
+                and not bind
+                and self._looked <= now < self._look_at
+                and self._versions == (self._keyring.version, self._home.version)
+            ):  # in one step, as it is opened in one (`tutelage.sgc.due`)
+                self.sequence = first = self.sequence + 1
+                header = make_header(
+                    VERSION, SESSION, SOLE, 0, SESSION_ID, self._epoch, self._sender, self.salt, first, now, label
+                )
+                return b"".join((header, sole.encrypt(BODY + header[SEQUENCE], payload, header), self._sessions[0].ident))
+            return self._seal(_flat(payload) if isinstance(payload, memoryview) else payload, 0, 1, label, bind, now)
 
     def seal_many(self, payloads: Sequence[Buffer], *, label: bytes = NO_LABEL, now: int | None = None) -> Packet:
         """Many small messages as one packet with one proof. `Opener.open_many` gives them back one by one.
@@ -138,8 +155,9 @@ class Sealer:
         Raises:
             As `seal`.
         """
-        parts = [_flat(each) if isinstance(each, memoryview) else each for each in payloads]
-        return self._seal(join_batch(parts), BATCH, len(parts), label, b"", now)
+        body = join_batch([_flat(each) if isinstance(each, memoryview) else each for each in payloads])
+        with self._lock:
+            return self._seal(body, BATCH, len(payloads), label, b"", time.time_ns() if now is None else now)
 
     def introduce(self) -> None:
         """Let the next packet carry this node's credential, as a receiver said that it does not know us."""
@@ -201,47 +219,43 @@ class Sealer:
         """Session mode: names of the nodes with a session."""
         return sorted({session.member.node for session in self._sessions})
 
-    def _seal(self, body: Buffer, flags: int, count: int, label: bytes, bind: bytes, now: int | None) -> Packet:
+    def _seal(self, body: Buffer, flags: int, count: int, label: bytes, bind: bytes, now: int) -> Packet:
+        """Whoever calls holds the lock."""
         if len(body) > MAX_PAYLOAD + 4 * (count + 1):
             raise ConfigError(f"a message of {len(body)} bytes for {self.alias}; {MAX_PAYLOAD} fit: split or compress it")
-        with self._lock:
-            now = time.time_ns() if now is None else now
-            cipher, sole = self._look(now), self._sole
-            first = self.sequence + 1
-            self.sequence += count
-            introduction, introduced = b"", 0
-            if sole is not None:
-                cipher, flags, proof = sole, flags | SOLE, SESSION_ID
-            elif self._mode == SESSION:
-                proof = SLOT * len(self._sessions)
-            else:
-                if not 0 < self._introduce_at - now <= self._introduce_every:
-                    introduction = self._home.credential
-                    introduced = len(introduction) + TAG
-                    self._introduce_at = now + self._introduce_every
-                if self._mode == CHAIN and self._link.due(now):
-                    flags |= ANCHOR
-                proof = self._proof_bytes(flags)
-            header = make_header(
-                VERSION, self._mode, flags, introduced, proof, self._epoch, self._sender, self.salt, first, now, label
-            )
-            if not introduced and len(body) <= _SMALL:
-                sealed = cipher.encrypt(nonce(BODY, header), body, header + bind if bind else header)
-                if sole is not None:
-                    return b"".join((header, sealed, self._sessions[0].ident))
-                sealed = header + sealed
-                return sealed + self._proof(cipher, header, bind, body, flags, first, sealed, now)
-            # Written in place, at its full length from the beginning: every copy of a large message counts.
-            start = HEADER + introduced
-            end = start + len(body) + TAG
-            packet = bytearray(end + proof)
-            with memoryview(packet) as view:
-                view[:HEADER] = header
-                if introduction:
-                    cipher.encrypt_into(nonce(INTRODUCTION, header), introduction, header, view[HEADER:start])
-                cipher.encrypt_into(nonce(BODY, header), body, header + bind, view[start:end])
-                view[end:] = self._proof(cipher, header, bind, body, flags, first, view[:end], now)
-            return packet
+        cipher, sole = self._look(now), self._sole
+        first = self.sequence + 1
+        self.sequence += count
+        introduction, introduced = b"", 0
+        if sole is not None:
+            cipher, flags, proof = sole, flags | SOLE, SESSION_ID
+        elif self._mode == SESSION:
+            proof = SLOT * len(self._sessions)
+        else:
+            if not 0 < self._introduce_at - now <= self._introduce_every:
+                introduction = self._home.credential
+                introduced = len(introduction) + TAG
+                self._introduce_at = now + self._introduce_every
+            if self._mode == CHAIN and self._link.due(now):
+                flags |= ANCHOR
+            proof = self._proof_bytes(flags)
+        header = make_header(
+            VERSION, self._mode, flags, introduced, proof, self._epoch, self._sender, self.salt, first, now, label
+        )
+        if not introduced and len(body) <= _SMALL:
+            sealed = header + cipher.encrypt(nonce(BODY, header), body, header + bind if bind else header)
+            return sealed + self._proof(cipher, header, bind, body, flags, first, sealed, now)
+        # Written in place, at its full length from the beginning: every copy of a large message counts.
+        start = HEADER + introduced
+        end = start + len(body) + TAG
+        packet = bytearray(end + proof)
+        with memoryview(packet) as view:
+            view[:HEADER] = header
+            if introduction:
+                cipher.encrypt_into(nonce(INTRODUCTION, header), introduction, header, view[HEADER:start])
+            cipher.encrypt_into(nonce(BODY, header), body, header + bind, view[start:end])
+            view[end:] = self._proof(cipher, header, bind, body, flags, first, view[:end], now)
+        return packet
 
     def _proof_bytes(self, flags: int) -> int:
         if self._mode == SIGNATURE:

@@ -18,14 +18,15 @@ from types import TracebackType
 from typing import Self
 
 from tutelage.errors import ConfigError
-from tutelage.sgc import delivery, lanes
+from tutelage.sgc import delivery, frames, lanes
 from tutelage.sgc.access import Authenticity, Delivery, Entry
 from tutelage.sgc.assembler import Assembler
-from tutelage.sgc.messages import Message
+from tutelage.sgc.due import Due
+from tutelage.sgc.messages import Message, make_message
 from tutelage.sgc.outlet import Outlet
 from tutelage.sgc.reasons import Reason, Refused
 from tutelage.sgc.repairs import Repair, Repairs
-from tutelage.sgc.sealing import Opened, Opener
+from tutelage.sgc.sealing import Opener
 from tutelage.sgc.transport.base import Transport, lent
 from tutelage.sgc.workers import Workers
 
@@ -120,10 +121,12 @@ class Subscription:
         self._last_refusal: Reason | None = None
         self._twice: set[str] = set()  # senders of which it was said that two programs send at once
         self._offer_at = float("inf")
-        self._direct = direct
         self._turn = threading.Lock()  # whose turn it is to deal with packets, if direct: the network's thread or our own
         self._session = rule.authenticity == Authenticity.SESSION
-        self._handles = [transport.subscribe(lanes.key(entry.name, lanes.STREAM), self._on_packet)]
+        self._due: Due | None = None
+        self._stream = delivery.Stream("", b"", 0, 0)  # where what is due is delivered
+        arrive = self._arrive_directly if direct else self._arrive
+        self._handles = [transport.subscribe(lanes.key(entry.name, lanes.STREAM), arrive)]
         if self._session:
             self._handles.append(transport.subscribe(lanes.key(entry.name, lanes.ANSWER), self._on_answer))
         self._thread = threading.Thread(target=self._work, name=f"sgc-subscribe-{alias}", daemon=True)
@@ -190,22 +193,37 @@ class Subscription:
 
     # -- on the network's threads ------------------------------------------------------------------------------------------
 
-    def _on_packet(self, packet: bytes) -> None:
+    def _arrive_directly(self, packet: bytes) -> None:
         if self.outlet.closed:
             return
-        if self._direct and self._inbox.empty() and not self.delivery.gapped and self._turn.acquire(False):
-            thread = get_ident()
-            lent.add(thread)
-            try:
-                now = time.time_ns()
-                self._take(now * 1e-9, packet, now)
-            except Exception:
-                log.exception("subscription of %s", self.alias)
-            finally:
-                lent.discard(thread)
-                self._turn.release()
-            if self.delivery.gapped:
-                self._look_again()  # our thread sees to the gap
+        if not self._inbox.empty() or self.delivery.gapped or not self._turn.acquire(False):
+            self._arrive(packet)
+            return
+        thread = get_ident()
+        lent.add(thread)
+        try:
+            now = time.time_ns()
+            due, stream = self._due, self._stream
+            if due is None or (opened := due.open(packet, stream.next, now)) is None:
+                self._take(now * 1e-9, packet, self.outlet.give, now)
+                self._expect()
+            else:
+                (payload, sent), received = opened, now * 1e-9
+                message = make_message((payload, due.sender, self.alias, stream.next, sent * 1e-9, received, True))
+                stream.next += 1
+                self.packets += 1
+                self.outlet.give([message])
+                self._heard(due.sender, sent, received)
+        except Exception:
+            log.exception("subscription of %s", self.alias)
+        finally:
+            lent.discard(thread)
+            self._turn.release()
+        if self.delivery.gapped:
+            self._look_again()  # our thread sees to the gap
+
+    def _arrive(self, packet: bytes) -> None:
+        if self.outlet.closed:
             return
         with self._lock:
             waiting, size = self._inbox.qsize(), self._inbox_bytes + len(packet)
@@ -268,7 +286,7 @@ class Subscription:
         received, refused = time.time(), 0
         for late in repair.packets:
             before = self.packets
-            self._take(received, late)
+            self._take(received, late, self.outlet.give)
             self.repaired += self.packets > before
             refused += self._last_refusal in FOR_GOOD if self.packets == before else 0
         ready = self.delivery.answered(repair.salt, repair.floor, time.monotonic(), in_vain=refused > 0)
@@ -281,7 +299,7 @@ class Subscription:
             if self._lossy:
                 self._take_newest(item)
             else:
-                self._take(*item)
+                self._take(*item, self.outlet.give)
         elif isinstance(item, _Answer):
             try:
                 self.opener.complete_session(item.packet)
@@ -292,25 +310,34 @@ class Subscription:
         else:
             held, self._held = self._held, deque(maxlen=HELD_PACKETS)
             for received, packet in held:
-                self._take(received, packet)
+                self._take(received, packet, self.outlet.give)
 
-    def _take(self, received: float, packet: bytes | memoryview, now: int | None = None) -> None:
-        """Open a packet, and give the messages that it completes. received: seconds since 1970; now: nanoseconds, None: the
-        clock."""
-        opened = self._open(received, packet, now)
-        if opened:
-            ready = self.delivery.accept_all(opened, time.monotonic())
-            self.outlet.give(self._assembler.messages(ready, received))
-            self._heard(opened[-1], received)
+    def _take(
+        self, received: float, packet: bytes | memoryview, give: Callable[[list[Message]], None], now: int | None = None
+    ) -> None:
+        """Open a packet, and give the messages that it completes.
 
-    def _open(self, received: float, packet: bytes | memoryview, now: int | None = None) -> list[Opened]:
+        received: seconds since 1970.
+        now: nanoseconds since 1970; None: the clock.
+        """
+        self._due = None
         try:
             opened = self.opener.open_many(packet, now=now)
         except Refused as refused:
             self._refused(refused.reason, received, packet)
-            return []
+            return
         self.packets += 1
-        return opened
+        if opened:
+            give(self._assembler.messages(self.delivery.accept_all(opened, time.monotonic()), received))
+            self._heard(opened[-1].sender, opened[-1].sent, received)
+
+    def _expect(self) -> None:
+        """After a packet was taken: another whole message of the same stream, if nothing is missing before it."""
+        due = self.opener.due()
+        if due is not None and due.kind == frames.Kind.WHOLE and not self._assembler.unfinished:
+            stream = self.delivery.current(due.sender)
+            if stream is not None and stream.salt == due.salt and not stream.held:
+                self._due, self._stream = due, stream
 
     def _say_twice(self) -> None:
         for sender in sorted(self.delivery.twice - self._twice):
@@ -321,9 +348,8 @@ class Subscription:
             )  # fmt: skip
         self._twice = set(self.delivery.twice)
 
-    def _heard(self, opened: Opened, received: float) -> None:
-        sender, took = opened.sender, received - opened.sent * 1e-9
-        before = self.latency.get(sender)
+    def _heard(self, sender: str, sent: int, received: float) -> None:
+        took, before = received - sent * 1e-9, self.latency.get(sender)
         self.last_heard[sender] = received
         self.latency[sender] = took if before is None else before + 0.1 * (took - before)
         if before is None and self._held:
@@ -371,17 +397,12 @@ class Subscription:
 
     def _take_newest(self, first: tuple[float, bytes]) -> None:
         """Lossy: everything that is there already is opened first; the application gets the newest."""
-        newest: deque[Message] = deque(maxlen=self._limit)
-        count = 0
+        messages: list[Message] = []
         item: tuple[float, bytes] | _Answer | _Retry | None = first
         while isinstance(item, tuple):
-            received, packet = item
-            opened = self._open(received, packet)
-            if opened:
-                more = self._assembler.messages(self.delivery.accept_all(opened, time.monotonic()), received)
-                newest += more
-                count += len(more)
-                self._heard(opened[-1], received)
+            self._take(*item, messages.extend)
+            self.outlet.superseded += max(0, len(messages) - self._limit)
+            del messages[: -self._limit]
             try:
                 item = self._inbox.get_nowait()
             except queues.Empty:
@@ -391,5 +412,4 @@ class Subscription:
                     self._inbox_bytes -= len(item[1])
             else:
                 self._inbox.put(item)
-        self.outlet.superseded += count - len(newest)
-        self.outlet.give(list(newest))
+        self.outlet.give(messages)
