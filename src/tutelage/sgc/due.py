@@ -14,11 +14,11 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from tutelage.sgc.home import Home
 from tutelage.sgc.keyring import Keyring
-from tutelage.sgc.packet import BEGINNING, BODY, HEADER, SEQUENCE, SESSION_ID, TAG, read_end
+from tutelage.sgc.packet import BEGINNING, BODY, HEADER, MAX_PACKET, SEQUENCE, SESSION_ID, TAG, read_end
 from tutelage.sgc.replay import TOLERANCE_NS, Window
 
 _LEAST = HEADER + TAG + SESSION_ID
-_MOST = 16 << 10  # bytes; `Opener` copies less of a packet
+_SMALL = 16 << 10  # bytes of a packet up to which a copy of a part costs less than a view of it
 
 
 @dataclass(slots=True)
@@ -60,7 +60,7 @@ class Due:
 
         None: the packet is not that one, or `Opener` has to look at it. Nothing is remembered of it then.
         """
-        if not (packet.startswith(self.beginning) and packet.endswith(self.ident) and _LEAST <= len(packet) <= _MOST):
+        if not (packet.startswith(self.beginning) and packet.endswith(self.ident) and _LEAST <= len(packet) <= MAX_PACKET):
             return None
         first, sent, label = read_end(packet, BEGINNING)
         window = self.window
@@ -75,8 +75,9 @@ class Due:
         ):
             return None
         header = packet[:HEADER]
+        whole = packet if len(packet) <= _SMALL else memoryview(packet)
         try:
-            body = self.cipher.decrypt(BODY + header[SEQUENCE], packet[HEADER:-SESSION_ID], header)
+            body = self.cipher.decrypt(BODY + header[SEQUENCE], whole[HEADER:-SESSION_ID], header)
         except InvalidTag:
             return None
         window.highest = first
