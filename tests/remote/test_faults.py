@@ -172,7 +172,7 @@ def test_who_is_not_the_server_cannot_command_and_who_is_not_the_robot_cannot_ob
     # What is no packet of the robot's is refused where it arrives, should a router carry it.
     before = sum(fleet.refused().values())
     for forged in (b"", b"x" * 200, bytes(300)):
-        fleet._subscriptions[0]._on_packet(forged)
+        fleet._subscriptions[0]._arrive(forged)
     eventually(lambda: sum(fleet.refused().values()) >= before + 3)
     all_move(fleet)
 
