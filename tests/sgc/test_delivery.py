@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tutelage.sgc import delivery, frames
+from tutelage.sgc.assembler import Assembler
 from tutelage.sgc.delivery import InOrder, Newest
+from tutelage.sgc.reasons import Refusals
 from tutelage.sgc.sealing import Opened
 
 SALT, OTHER = b"s" * 16, b"o" * 16
@@ -188,12 +190,29 @@ def test_large_messages_come_back_from_their_pieces(size: int, start: int) -> No
     assert all(frames.age_of(label) == 1.5 for label, _ in parts)
 
 
-def test_a_message_that_lacks_a_piece_is_dropped_and_counted() -> None:
+def test_a_message_that_lacks_a_piece_is_dropped() -> None:
     parts = list(frames.pieces(memoryview(bytes(3 * frames.PIECE)), 0.0))
     assembly = frames.Assembly()
     assert [assembly.take(k, parts[k][0], bytes(parts[k][1])) for k in (0, 2)] == [None, None]
-    assert assembly.broken == 1
+    assert not assembly.unfinished
     assert assembly.take(3, frames.label(frames.Kind.WHOLE, 0.0), b"next") == b"next"
+
+
+def test_what_an_earlier_start_left_unfinished_is_forgotten() -> None:
+    """Else it would be kept for good, where the present one sends whole messages only."""
+    present = {SALT}
+    assembler = Assembler("log", Refusals(), lambda: present)
+    pieces = [
+        message(k + 1)._replace(payload=bytes(part), label=label)
+        for k, (label, part) in enumerate(frames.pieces(memoryview(bytes(3 * frames.PIECE)), 0.0))
+    ]
+    assert assembler.messages(pieces[:2], 0.0) == []
+    assert set(assembler.unfinished) == {SALT}
+    present = {OTHER}
+    assert [each.payload for each in assembler.messages([message(1, OTHER)], 0.0)] == [b"x"]
+    assert not assembler.unfinished
+    assert [len(each.payload) for each in assembler.messages(pieces, 0.0)] == [3 * frames.PIECE]  # released all at once
+    assert not assembler.unfinished
 
 
 @given(st.binary(min_size=16, max_size=16), st.binary(max_size=40))

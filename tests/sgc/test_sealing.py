@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -338,6 +339,24 @@ def test_digests_of_long_messages_depend_on_every_chunk() -> None:
         digests.add(digest(body))
     assert len(digests) == 5
     assert digest(bytes(1 << 20)) != digest(bytes((1 << 20) + 1))
+
+
+class Emptied(list[bytes]):
+    """What its owner uses again as soon as it was read."""
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield from [self.pop(0) for _ in range(len(self))]
+
+
+@pytest.mark.parametrize(("alias", "sender", "receiver"), STREAMS)
+def test_a_list_that_changes_while_it_is_sealed_costs_no_number(
+    fleet: Fleet, alias: str, sender: str, receiver: str
+) -> None:
+    """Two messages with one number would be two with one nonce."""
+    sealer, _ = fleet.pair(alias, sender, receiver)
+    sealer.seal(b"first")
+    sealer.seal_many(Emptied([b"a", b"b", b"c"]))
+    assert sealer.sequence == 4
 
 
 def test_sealing_is_safe_from_several_threads(fleet: Fleet) -> None:

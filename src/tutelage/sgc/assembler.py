@@ -34,6 +34,9 @@ class Assembler:
             payload = body if whole else self._assemble(salt, sequence, label, body)
             if payload is not None:
                 messages.append(make_message((payload, sender, alias, sequence, sent * 1e-9, received, authentic)))
+        if self.unfinished:
+            present = self._present()
+            self.unfinished = {each: assembly for each, assembly in self.unfinished.items() if each in present}
         return messages
 
     def _assemble(self, salt: bytes, sequence: int, label: bytes, body: bytes) -> bytes | None:
@@ -46,6 +49,4 @@ class Assembler:
             return None
         finally:
             if assembly.unfinished:
-                present = self._present()
-                self.unfinished = {each: other for each, other in self.unfinished.items() if each in present}
                 self.unfinished[salt] = assembly

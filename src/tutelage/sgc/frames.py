@@ -88,8 +88,6 @@ class Assembly:
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._next = 0  # sequence number of the piece that must come now
-        self.broken = 0
-        """Messages of which a piece is missing."""
 
     @property
     def unfinished(self) -> bool:
@@ -105,13 +103,12 @@ class Assembly:
         frame = parse(label, body)
         if self._parts and (sequence != self._next or frame.index != len(self._parts)):
             self._parts.clear()
-            self.broken += 1
         if frame.kind == Kind.WHOLE:
             return body
         if frame.kind == Kind.LIFE:
             return None
         if frame.index != len(self._parts):
-            return None  # the rest of a message whose beginning is lost; counted when it broke, or before we listened
+            return None  # the rest of a message whose beginning is lost, or was sent before we listened
         self._parts.append(body)
         self._next = sequence + 1
         if frame.index < frame.count - 1:

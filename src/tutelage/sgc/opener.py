@@ -167,7 +167,8 @@ class Opener:
             return told
 
     def due(self) -> Due | None:
-        """The packet that follows the one that was opened last; None: that one was not a message for one session."""
+        """The packet that follows the one that was opened last. None: that one was refused, bound to something, or not one
+        message for one session. Only for whoever is alone in using this opener."""
         if self._last is None or (sole := self._last[2].sole) is None:
             return None
         beginning, kind, stream, window = self._last

@@ -155,9 +155,10 @@ class Sealer:
         Raises:
             As `seal`.
         """
-        body = join_batch([_flat(each) if isinstance(each, memoryview) else each for each in payloads])
+        parts = [_flat(each) if isinstance(each, memoryview) else each for each in payloads]  # the caller's list may change
+        body = join_batch(parts)
         with self._lock:
-            return self._seal(body, BATCH, len(payloads), label, b"", time.time_ns() if now is None else now)
+            return self._seal(body, BATCH, len(parts), label, b"", time.time_ns() if now is None else now)
 
     def introduce(self) -> None:
         """Let the next packet carry this node's credential, as a receiver said that it does not know us."""
