@@ -18,10 +18,9 @@ from benchmarks.connectivity.stacks import STACKS
 SIZES = {"64 B": 64, "8 KB": 8 << 10, "256 KB": 256 << 10, "14 MB": 14 << 20}
 TRIPS = {"64 B": 40, "8 KB": 40, "256 KB": 10, "14 MB": 3}
 TURNS = {"64 B": 5, "8 KB": 5, "256 KB": 3, "14 MB": 1}
-"""Round trips when it is a stack's turn, and turns in a round; of chains, whose lone messages wait for their anchors,
-a tenth of the trips, but three. Turns are short, so that all stacks meet the machine in the same state, and there are
-many of them: where other programs share the processor, the ratio of two stacks in one turn differs by a fifth from
-that in the next."""
+"""Round trips when it is a stack's turn, and turns in a round; of chains, whose lone messages wait for their anchors, a
+tenth of the trips, but three. Turns are short, so that all stacks meet the machine in the same state, and there are many, as
+other programs on the same processor make the ratio of two stacks differ from one turn to the next."""
 
 WARM_UP = 300
 """Round trips of 256 KB, and two of 14 MB, before the first round. By then a publisher's history is full (64 MiB), as it is

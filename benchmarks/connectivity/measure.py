@@ -16,7 +16,7 @@ def run(quick: bool = False) -> dict[str, Any]:
 
     found = loopback.measure(quick)
     show("round trip, median; 1000-byte messages a second that arrived, one way", found["round_trips_and_rates"])
-    show("ratios, medians over rounds", found["ratios"])
+    show("ratios, medians over turns", found["ratios"])
     found["directory"] = show("directory", [directory.measure(1000 if quick else 10_000)])
     found["start"] = show("from start to first message", start.measure(3 if quick else 15))
     found["wan"] = wan.measure(quick)

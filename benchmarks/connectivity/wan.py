@@ -72,10 +72,10 @@ def robot(setup: dict[str, Any], rounds: int) -> list[dict[str, Any]]:
     times: dict[str, dict[str, list[float]]] = {name: {size: [] for size in SIZES} for name in WAN}
     lost = dict.fromkeys(WAN, 0)
 
-    def trips(name: str, size: str, length: int) -> None:
+    def trips(name: str, size: str) -> None:
         for _ in range(TRIPS[size]):
             try:
-                times[name][size].append(1e3 * made[name].round_trip(os.urandom(length)))
+                times[name][size].append(1e3 * made[name].round_trip(os.urandom(SIZES[size])))
             except TimeoutError:
                 if not name.startswith("zenoh"):
                     raise
@@ -85,9 +85,9 @@ def robot(setup: dict[str, Any], rounds: int) -> list[dict[str, Any]]:
         for pair in made.values():
             pair.answer_with("digest")
         for turn in range(rounds):
-            for size, length in SIZES.items():
+            for size in SIZES:
                 for name in [*WAN[turn % len(WAN) :], *WAN[: turn % len(WAN)]]:
-                    trips(name, size, length)
+                    trips(name, size)
     return [
         {"stack": name} | {f"{size} mean ms": statistics.mean(taken) for size, taken in of.items()} | {"lost": lost[name]}
         for name, of in times.items()

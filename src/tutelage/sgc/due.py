@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from tutelage.sgc.home import Home
 from tutelage.sgc.keyring import Keyring
-from tutelage.sgc.packet import BEGINNING, BODY, HEADER, MAX_PACKET, SEQUENCE, SESSION_ID, TAG, read_end
+from tutelage.sgc.packet import BEGINNING, BODY, HEADER, MAX_PACKET, SESSION_ID, TAG, nonce, read_end
 from tutelage.sgc.replay import TOLERANCE_NS, Window
 
 _LEAST = HEADER + TAG + SESSION_ID
@@ -77,7 +77,7 @@ class Due:
         header = packet[:HEADER]
         whole = packet if len(packet) <= _SMALL else memoryview(packet)
         try:
-            body = self.cipher.decrypt(BODY + header[SEQUENCE], whole[HEADER:-SESSION_ID], header)
+            body = self.cipher.decrypt(nonce(BODY, header), whole[HEADER:-SESSION_ID], header)
         except InvalidTag:
             return None
         window.highest = first

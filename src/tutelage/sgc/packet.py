@@ -46,8 +46,7 @@ HEADER = _HEADER.size
 BEGINNING = 44
 """Bytes of a header that are alike from packet to packet while nothing special happens: up to the sequence number."""
 _FLAGS = 3
-SEQUENCE = slice(44, 52)
-_IDENT = slice(12, 52)
+_IDENT, _SEQUENCE = slice(12, 52), slice(BEGINNING, 52)
 NO_LABEL = bytes(16)
 SESSION_ID = 8
 SLOT = SESSION_ID + TAG
@@ -121,7 +120,7 @@ def anchored(packet: Buffer) -> bool:
 def nonce(purpose: bytes, header: bytes) -> bytes:
     """12 bytes that never repeat under one key: what for, and the sequence number in a header. Keys differ by salt, and a
     salt is never used twice."""
-    return purpose + header[SEQUENCE]
+    return purpose + header[_SEQUENCE]
 
 
 def message_key(epoch_key: bytes, name: bytes, lane: Lane, epoch: int, sender: bytes, salt: bytes) -> bytes:

@@ -31,7 +31,6 @@ from tutelage.sgc.packet import (
     NO_LABEL,
     PROOF,
     SALT_BYTES,
-    SEQUENCE,
     SESSION,
     SESSION_ID,
     SIGNATURE,
@@ -144,7 +143,7 @@ class Sealer:
                 header = make_header(
                     VERSION, SESSION, SOLE, 0, SESSION_ID, self._epoch, self._sender, self.salt, first, now, label
                 )
-                return b"".join((header, sole.encrypt(BODY + header[SEQUENCE], payload, header), self._sessions[0].ident))
+                return b"".join((header, sole.encrypt(nonce(BODY, header), payload, header), self._sessions[0].ident))
             return self._seal(_flat(payload) if isinstance(payload, memoryview) else payload, 0, 1, label, bind, now)
 
     def seal_many(self, payloads: Sequence[Buffer], *, label: bytes = NO_LABEL, now: int | None = None) -> Packet:

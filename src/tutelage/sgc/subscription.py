@@ -123,8 +123,7 @@ class Subscription:
         self._offer_at = float("inf")
         self._turn = threading.Lock()  # whose turn it is to deal with packets, if direct: the network's thread or our own
         self._session = rule.authenticity == Authenticity.SESSION
-        self._due: Due | None = None
-        self._stream = delivery.Stream("", b"", 0, 0)  # where what is due is delivered
+        self._due: tuple[Due, delivery.Stream] | None = None  # what is due, and where it is delivered
         arrive = self._arrive_directly if direct else self._arrive
         self._handles = [transport.subscribe(lanes.key(entry.name, lanes.STREAM), arrive)]
         if self._session:
@@ -203,12 +202,12 @@ class Subscription:
         lent.add(thread)
         try:
             now = time.time_ns()
-            due, stream = self._due, self._stream
-            if due is None or (opened := due.open(packet, stream.next, now)) is None:
+            expected = self._due
+            if expected is None or (opened := expected[0].open(packet, expected[1].next, now)) is None:
                 self._take(now * 1e-9, packet, self.outlet.give, now)
                 self._expect()
             else:
-                (payload, sent), received = opened, now * 1e-9
+                (due, stream), (payload, sent), received = expected, opened, now * 1e-9
                 message = make_message((payload, due.sender, self.alias, stream.next, sent * 1e-9, received, True))
                 stream.next += 1
                 self.packets += 1
@@ -337,7 +336,7 @@ class Subscription:
         if due is not None and due.kind == frames.Kind.WHOLE and not self._assembler.unfinished:
             stream = self.delivery.current(due.sender)
             if stream is not None and stream.salt == due.salt and not stream.held:
-                self._due, self._stream = due, stream
+                self._due = due, stream
 
     def _say_twice(self) -> None:
         for sender in sorted(self.delivery.twice - self._twice):
